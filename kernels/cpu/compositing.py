@@ -37,7 +37,7 @@ def pack_block(
 @native_function("compositing.h")
 def composite_tile(
     tile: int, packed: wp.array2d[float], background: wp.array[float], ranges: wp.array[wp.vec2i],
-    splats: wp.array[int], width: int, height: int, columns: int, sharpness: float,
+    splats: wp.array[int], width: int, height: int, columns: int, sharpness: float, depth_unit: wp.float64,
     image: wp.array3d[float], alpha_image: wp.array2d[float], transmittance: wp.array2d[float], last: wp.array2d[int],
 ): ...
 
@@ -59,10 +59,6 @@ def sum_slots_block(
 ): ...
 
 
-@native_function("depth.h")
-def expected_depth_block(
-    begin: int, accumulated: wp.array[float], alpha: wp.array[float], unit: wp.float64, depth: wp.array[float],
-): ...
 # fmt: on
 
 
@@ -95,6 +91,7 @@ def composite(
     height: int,
     columns: int,
     sharpness: float,
+    depth_unit: wp.float64,  # above 0: the last channel is depth, which is divided by alpha and by this unit
     # Out:
     image_out: wp.array3d[float],  # [C, H, W]
     alpha_out: wp.array2d[float],  # [H, W]
@@ -111,6 +108,7 @@ def composite(
         height,
         columns,
         sharpness,
+        depth_unit,
         image_out,
         alpha_out,
         transmittance_out,
@@ -186,17 +184,3 @@ def sum_slots(
         v_channels_out,
         absgrad_out,
     )
-
-
-@wp.kernel
-def expected_depth(
-    first: int,
-    # In:
-    accumulated_in: wp.array[float],  # [H W] depth times alpha
-    alpha_in: wp.array[float],  # [H W]
-    unit: wp.float64,
-    # Out:
-    depth_out: wp.array[float],  # [H W]
-):
-    """Divide the accumulated depths of 16 pixels by alpha, then by the unit. Grid: ceil(H W / 16)."""
-    expected_depth_block((first + wp.tid()) * _LANES, accumulated_in, alpha_in, unit, depth_out)

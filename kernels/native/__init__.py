@@ -23,7 +23,7 @@ from typing import Any, Literal
 
 import warp as wp
 
-from .. import binning, correctives, harmonics, neighbors, projection, shading, ssim, types
+from .. import binning, correctives, harmonics, neighbors, posing, projection, shading, ssim, types
 
 FOLDER = Path(__file__).parent
 CONSTANTS: dict[str, int | float] = {
@@ -62,8 +62,10 @@ CONSTANTS: dict[str, int | float] = {
     "GRADIENT_MAX": types.GRADIENT_MAX,
     "POSITION_MAX": types.POSITION_MAX,
     "RADIUS_MAX": projection.RADIUS_MAX,
-    # Correctives and shading.
+    # Correctives, shading and posing.
     "CORRECTIVE_SCALE": correctives.SCALE,
+    "EXTRAS_LOG_SCALES": posing.LOG_SCALES,
+    "EXTRAS_TINTS": posing.TINTS,
     "SHADING_BEND": shading.BEND,
     "SHADING_GAIN_MAX": shading.GAIN_MAX,
     "SHADING_GREY": shading.GREY,

@@ -19,8 +19,9 @@ static inline void exponential_block(int begin, const wp::array_t<float>& values
     store(results.data + begin, whole_exponential(load(values.data + begin, n)), n);
 }
 
+ALWAYS_INLINE vf sigmoid_of(vf x) { return 1.0f / (1.0f + whole_exponential(-x)); }
+
 static inline void sigmoid_block(int begin, const wp::array_t<float>& values, wp::array_t<float>& results) {
     const int n = values.shape[0] - begin < 16 ? values.shape[0] - begin : 16;
-    const vf x = load(values.data + begin, n);
-    store(results.data + begin, 1.0f / (1.0f + whole_exponential(-x)), n);
+    store(results.data + begin, sigmoid_of(load(values.data + begin, n)), n);
 }

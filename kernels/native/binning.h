@@ -214,6 +214,7 @@ static inline void sort_band(
         to = swap;
     }
 
+    const bool with_slots = slots.shape.dims[0] > 0;
     for (int k = 0; k < n; ++k) {
         const int* stretch = stretches.data + 4ll * (unsigned)from[k];
         if (k + 16 < n) __builtin_prefetch(stretches.data + 4ll * (unsigned)from[k + 16]);
@@ -221,7 +222,7 @@ static inline void sort_band(
         for (int column = stretch[2]; column < stretch[3]; ++column, ++slot) {
             const int at = cursor[column]++;
             splats.data[at] = stretch[0];
-            slots.data[at] = slot;
+            if (with_slots) slots.data[at] = slot;
         }
     }
 }

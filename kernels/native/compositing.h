@@ -11,11 +11,17 @@ enum {
     AHEAD_ADJOINT = 8,           // the same in the adjoint, which takes longer over a pair
 };
 
+// Divide accumulated depths by their alpha, then by the unit in double precision.
+ALWAYS_INLINE vf expected(vf accumulated, vf alpha, double unit) {
+    const vf mean = accumulated / (alpha > 1e-10f ? alpha : vf{} + 1e-10f);
+    return __builtin_convertvector(__builtin_convertvector(mean, vd) * (1.0 / unit), vf);
+}
+
 static inline void composite_tile(
     int tile, const wp::array_t<float>& packed, const wp::array_t<float>& background,
     const wp::array_t<wp::vec_t<2, int>>& ranges, const wp::array_t<int>& splats, int width, int height, int columns,
-    float sharpness, wp::array_t<float>& image, wp::array_t<float>& alpha_image, wp::array_t<float>& transmittance,
-    wp::array_t<int>& last
+    float sharpness, double depth_unit, wp::array_t<float>& image, wp::array_t<float>& alpha_image,
+    wp::array_t<float>& transmittance, wp::array_t<int>& last
 ) {
     FUSE_WITHIN_EXPRESSIONS
     const Tile place = Tile(tile, ranges, width, height, columns);
@@ -42,6 +48,7 @@ static inline void composite_tile(
         enum { value = 0 };
     };
     const bool keep = last.shape.dims[0] > 0;
+    const int channels = image.shape.dims[0], depth = depth_unit > 0.0 ? channels - 1 : -1;
 
     // One pass over the tile's splats for `count` channels from c0 on; only the first pass stores alpha and the like.
     // For each chunk of 32 splats and each block, the block's state stays in registers while the splats that reach it
@@ -104,7 +111,10 @@ static inline void composite_tile(
             const long long at = place.at(b);
             const int columns_left = place.wide_of(b), rows_left = place.tall_of(b);
             auto put = [&](float* to, vf v) { store_block(to + at, v, width, columns_left, rows_left); };
-            for (int c = 0; c < count; ++c) put(image.data + (c0 + c) * plane, sum[b][c] + t * background.data[c0 + c]);
+            for (int c = 0; c < count; ++c) {
+                const vf value = sum[b][c] + t * background.data[c0 + c];
+                put(image.data + (c0 + c) * plane, c0 + c == depth ? expected(value, 1.0f - t, depth_unit) : value);
+            }
             if (c0 == 0) put(alpha_image.data, 1.0f - t);
             if (KEEP) {
                 put(transmittance.data, t);
@@ -112,7 +122,6 @@ static inline void composite_tile(
             }
         }
     };
-    const int channels = image.shape.dims[0];
     for (int c0 = 0; c0 == 0 || c0 < channels; c0 += GROUP) {
         const int count = channels - c0 < GROUP ? channels - c0 : GROUP;
         const bool first_pass = keep && c0 == 0;

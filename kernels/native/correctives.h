@@ -6,22 +6,25 @@
 struct Turns {
     vf turn[9], rotation[9];
 
-    __attribute__((always_inline)) Turns(
-        int begin, int rows, const wp::array_t<wp::vec4>& quats, const wp::array_t<wp::vec4>& quats_t,
-        const wp::array_t<wp::vec4>& quats_own, int has_own
-    ) {
-        vf rest[4], posed[4];
-        read_vectors(quats.data, begin, rows, 4, rest);
-        read_vectors(quats_t.data, begin, rows, 4, posed);
+    __attribute__((always_inline)) Turns(const vf* rest, const vf* posed, const vf* own) {
         rotation_between(rest, posed, rotation);
         for (int k = 0; k < 9; ++k) turn[k] = rotation[k];
-        if (has_own) {
-            read_vectors(quats_own.data, begin, rows, 4, posed);
-            rotation_between(rest, posed, turn);
-        }
+        if (own) rotation_between(rest, own, turn);
         subtract_identity(turn);
     }
 };
+
+// Read the rotations of a block.
+ALWAYS_INLINE Turns read_turns(
+    int begin, int rows, const wp::array_t<wp::vec4>& quats, const wp::array_t<wp::vec4>& quats_t,
+    const wp::array_t<wp::vec4>& quats_own, int has_own
+) {
+    vf rest[4], posed[4], own[4];
+    read_vectors(quats.data, begin, rows, 4, rest);
+    read_vectors(quats_t.data, begin, rows, 4, posed);
+    if (has_own) read_vectors(quats_own.data, begin, rows, 4, own);
+    return Turns(rest, posed, has_own ? own : nullptr);
+}
 
 // Read the 27 columns of the matrices C as two sixteens that overlap.
 ALWAYS_INLINE void read_matrix(const wp::array_t<float>& correctives, int begin, int rows, vf* C) {
@@ -32,17 +35,10 @@ ALWAYS_INLINE void read_matrix(const wp::array_t<float>& correctives, int begin,
     for (int k = 5; k < 16; ++k) C[11 + k] = right[k];
 }
 
-static inline void correct_block(
-    int begin, const wp::array_t<wp::vec3>& means, const wp::array_t<float>& correctives,
-    const wp::array_t<wp::vec4>& quats, const wp::array_t<wp::vec4>& quats_t, const wp::array_t<wp::vec4>& quats_own,
-    int has_own, wp::array_t<wp::vec3>& means_t
-) {
+// Displace the means of a block.
+ALWAYS_INLINE void displace(const vf* C, const Turns& turns, vf* mean) {
     FUSE_WITHIN_EXPRESSIONS
-    const int rows = means.shape[0] - begin < 16 ? means.shape[0] - begin : 16;
-    const Turns turns = Turns(begin, rows, quats, quats_t, quats_own, has_own);
-    vf C[27], mean[3], shift[3], moved[3];
-    read_matrix(correctives, begin, rows, C);
-    read_vectors(means.data, begin, rows, 3, mean);
+    vf shift[3], moved[3];
     for (int a = 0; a < 3; ++a) {
         shift[a] = C[9 * a] * turns.turn[0];
         for (int k = 1; k < 9; ++k) shift[a] = shift[a] + C[9 * a + k] * turns.turn[k];
@@ -54,8 +50,21 @@ static inline void correct_block(
         change = change + (moved[a] - mean[a]);
     }
     const vi valid = finite(change);
-    for (int a = 0; a < 3; ++a) moved[a] = valid ? moved[a] : mean[a];
-    write_vectors(means_t.data, begin, rows, 3, moved);
+    for (int a = 0; a < 3; ++a) mean[a] = valid ? moved[a] : mean[a];
+}
+
+static inline void correct_block(
+    int begin, const wp::array_t<wp::vec3>& means, const wp::array_t<float>& correctives,
+    const wp::array_t<wp::vec4>& quats, const wp::array_t<wp::vec4>& quats_t, const wp::array_t<wp::vec4>& quats_own,
+    int has_own, wp::array_t<wp::vec3>& means_t
+) {
+    const int rows = means.shape[0] - begin < 16 ? means.shape[0] - begin : 16;
+    const Turns turns = read_turns(begin, rows, quats, quats_t, quats_own, has_own);
+    vf C[27], mean[3];
+    read_matrix(correctives, begin, rows, C);
+    read_vectors(means.data, begin, rows, 3, mean);
+    displace(C, turns, mean);
+    write_vectors(means_t.data, begin, rows, 3, mean);
 }
 
 static inline void correct_block_adjoint(
@@ -66,7 +75,7 @@ static inline void correct_block_adjoint(
     FUSE_WITHIN_EXPRESSIONS
     const int total_rows = correctives.shape[0];
     const int rows = total_rows - begin < 16 ? total_rows - begin : 16;
-    const Turns turns = Turns(begin, rows, quats, quats_t, quats_own, has_own);
+    const Turns turns = read_turns(begin, rows, quats, quats_t, quats_own, has_own);
     vf C[27], v_mean[3], v_shift[3], v_C[27], right[16], total = {};
     read_matrix(correctives, begin, rows, C);
     read_vectors(v_means_t.data, begin, rows, 3, v_mean);

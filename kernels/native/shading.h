@@ -3,20 +3,14 @@
 #include "exponential.h"
 #include "turn_block.h"
 
-// What the gain of a block's Gaussians depends on.
+// What the gain of a block's Gaussians depends on; `turn` is their rotation since rest, less the identity.
 struct Gain {
     vf turn[9], x, bend, free;
 
-    __attribute__((always_inline)) Gain(
-        int begin, int rows, const wp::array_t<float>& shading, const wp::array_t<wp::vec4>& quats,
-        const wp::array_t<wp::vec4>& quats_t
-    ) {
+    __attribute__((always_inline)) Gain(int begin, int rows, const wp::array_t<float>& shading, const vf* since_rest) {
         FUSE_WITHIN_EXPRESSIONS
-        vf rest[4], posed[4], G[16];
-        read_vectors(quats.data, begin, rows, 4, rest);
-        read_vectors(quats_t.data, begin, rows, 4, posed);
-        rotation_between(rest, posed, turn);
-        subtract_identity(turn);
+        vf G[16];
+        for (int k = 0; k < 9; ++k) turn[k] = since_rest[k];
         read_columns(shading.data, 10ll * shading.shape[0], begin, rows, 10, 0, G);
         x = G[0] * turn[0];
         for (int k = 1; k < 9; ++k) x = x + G[k] * turn[k];
@@ -32,16 +26,35 @@ struct Gain {
     }
 };
 
+// Read the gain of a block.
+ALWAYS_INLINE Gain read_gain(
+    int begin, int rows, const wp::array_t<float>& shading, const wp::array_t<wp::vec4>& quats,
+    const wp::array_t<wp::vec4>& quats_t
+) {
+    vf rest[4], posed[4], turn[9];
+    read_vectors(quats.data, begin, rows, 4, rest);
+    read_vectors(quats_t.data, begin, rows, 4, posed);
+    rotation_between(rest, posed, turn);
+    subtract_identity(turn);
+    return Gain(begin, rows, shading, turn);
+}
+
+// Multiply a block's colours, above grey, by a factor.
+ALWAYS_INLINE void brighten(vf factor, vf& color) {
+    FUSE_WITHIN_EXPRESSIONS
+    color = factor * (color + SHADING_GREY) - SHADING_GREY;
+}
+
 static inline void shade_block(
     int begin, const wp::array_t<wp::vec3>& sh_dc, const wp::array_t<float>& shading,
     const wp::array_t<wp::vec4>& quats, const wp::array_t<wp::vec4>& quats_t, wp::array_t<wp::vec3>& shaded
 ) {
     FUSE_WITHIN_EXPRESSIONS
     const int rows = sh_dc.shape[0] - begin < 16 ? sh_dc.shape[0] - begin : 16;
-    const vf factor = Gain(begin, rows, shading, quats, quats_t).limited();
+    const vf factor = read_gain(begin, rows, shading, quats, quats_t).limited();
     vf color[3];
     read_vectors(sh_dc.data, begin, rows, 3, color);
-    for (int c = 0; c < 3; ++c) color[c] = factor * (color[c] + SHADING_GREY) - SHADING_GREY;
+    for (int c = 0; c < 3; ++c) brighten(factor, color[c]);
     write_vectors(shaded.data, begin, rows, 3, color);
 }
 
@@ -52,7 +65,7 @@ static inline void shade_block_adjoint(
 ) {
     FUSE_WITHIN_EXPRESSIONS
     const int rows = sh_dc.shape[0] - begin < 16 ? sh_dc.shape[0] - begin : 16;
-    const Gain gain = Gain(begin, rows, shading, quats, quats_t);
+    const Gain gain = read_gain(begin, rows, shading, quats, quats_t);
     const vf factor = gain.limited();
     vf color[3], v[3], v_color[3], v_factor = {}, v_G[16] = {};
     read_vectors(sh_dc.data, begin, rows, 3, color);
@@ -86,7 +99,7 @@ static inline void tint_block(
     vf color[3], tint[3];
     read_vectors(sh_dc.data, begin, rows, 3, color);
     read_vectors(tints.data, begin, rows, 3, tint);
-    for (int c = 0; c < 3; ++c) color[c] = tint_factor(tint[c]) * (color[c] + SHADING_GREY) - SHADING_GREY;
+    for (int c = 0; c < 3; ++c) brighten(tint_factor(tint[c]), color[c]);
     write_vectors(tinted.data, begin, rows, 3, color);
 }
 

@@ -3,37 +3,52 @@
 #include "exponential.h"
 #include "skinning_block.h"
 
-// Move the Gaussians at x and q by their blended motion, and write them.
-ALWAYS_INLINE void move(
-    int begin, int rows, const vf* x, const vf* q, const wp::array_t<float>& motion, const wp::array_t<float>& reach,
-    const int* pick, int K, const float* weight, const vf* weights_of, int aligned, int has_extras,
-    wp::array_t<wp::vec3>& means_t, wp::array_t<wp::vec4>& quats_t, wp::array_t<wp::vec3>& extras
+// Gaussians that were moved: positions, unit quaternions, and the blends of the extras, if there are any.
+struct Moved {
+    vf mean[3], quat[4], extra[3];
+
+    // Write them; `extras` is touched only with has_extras.
+    __attribute__((always_inline)) void write(
+        int begin, int rows, int has_extras, wp::array_t<wp::vec3>& means_t, wp::array_t<wp::vec4>& quats_t,
+        wp::array_t<wp::vec3>& extras
+    ) const {
+        write_vectors(means_t.data, begin, rows, 3, mean);
+        write_vectors(quats_t.data, begin, rows, 4, quat);
+        if (has_extras) write_vectors(extras.data, begin, rows, 3, extra);
+    }
+};
+
+// Move the Gaussians at x and q by their blended motion.
+ALWAYS_INLINE Moved moved_by(
+    const vf* x, const vf* q, const wp::array_t<float>& motion, const wp::array_t<float>& reach, const int* pick, int K,
+    const float* weight, const vf* weights_of, int aligned, int has_extras
 ) {
     FUSE_WITHIN_EXPRESSIONS
-    vf B[16], side[MAX_NEIGHBORS];
+    Moved to;
+    vf B[16], side[MAX_NEIGHBORS], b[4], u[4];
     blend(motion.data, pick, weight, weights_of, K, aligned, side, B);
-    vf moved[3], b[4], u[4];
-    for (int c = 0; c < 3; ++c) moved[c] = B[4 * c] * x[0] + B[4 * c + 1] * x[1] + B[4 * c + 2] * x[2] + B[4 * c + 3];
+    for (int c = 0; c < 3; ++c) to.mean[c] = B[4 * c] * x[0] + B[4 * c + 1] * x[1] + B[4 * c + 2] * x[2] + B[4 * c + 3];
     vf nb = inverse_norm(B[12], B[13], B[14], B[15]), nq = inverse_norm(q[0], q[1], q[2], q[3]);
     normalise(B + 12, nb, b);
     normalise(q, nq, u);
-    vf turned[4] = {
-        b[0] * u[0] - b[1] * u[1] - b[2] * u[2] - b[3] * u[3], b[0] * u[1] + b[1] * u[0] + b[2] * u[3] - b[3] * u[2],
-        b[0] * u[2] - b[1] * u[3] + b[2] * u[0] + b[3] * u[1], b[0] * u[3] + b[1] * u[2] - b[2] * u[1] + b[3] * u[0]
-    };
-    write_vectors(means_t.data, begin, rows, 3, moved);
-    write_vectors(quats_t.data, begin, rows, 4, turned);
+    to.quat[0] = b[0] * u[0] - b[1] * u[1] - b[2] * u[2] - b[3] * u[3];
+    to.quat[1] = b[0] * u[1] + b[1] * u[0] + b[2] * u[3] - b[3] * u[2];
+    to.quat[2] = b[0] * u[2] - b[1] * u[3] + b[2] * u[0] + b[3] * u[1];
+    to.quat[3] = b[0] * u[3] + b[1] * u[2] - b[2] * u[1] + b[3] * u[0];
     if (has_extras) {
         float sums[16][4];
+        vf a[4], columns[4];
         for (int l = 0; l < 16; ++l) {
             v4 row = {};
             for (int k = 0; k < K; ++k)
                 row = row + weight[l * K + k] * *(const v4*)(reach.data + 16ll * pick[l * K + k] + 4);
             *(v4*)sums[l] = row;
         }
-        for (int l = 0; l < rows; ++l)
-            for (int c = 0; c < 3; ++c) extras.data[begin + l].c[c] = sums[l][1 + c];
+        for (int i = 0; i < 4; ++i) a[i] = load16(sums[4 * i]);
+        split4(a, columns);
+        for (int c = 0; c < 3; ++c) to.extra[c] = columns[1 + c];
     }
+    return to;
 }
 
 // Skin with known weights.
@@ -62,7 +77,8 @@ static inline void skin(
         const float* weight = (const float*)read_rows(weights.data + (long long)begin * K, rows, 4 * K, spare_weights);
         vf columns[16];
         if (!aligned) weight_columns(weight, K, columns);
-        move(begin, rows, x, q, motion, reach, pick, K, weight, columns, aligned, has_extras, means_t, quats_t, extras);
+        const Moved to = moved_by(x, q, motion, reach, pick, K, weight, columns, aligned, has_extras);
+        to.write(begin, rows, has_extras, means_t, quats_t, extras);
     };
     if (indices.shape[1] == 4)
         run(Four{});
@@ -121,9 +137,8 @@ static inline void skin_rbf(
         for (int k = 0; k < K; ++k) w[k] = w[k] * inverse;
         weight_rows(w, K, spare_weights);
         __builtin_memcpy(weights.data + (long long)begin * K, spare_weights, 4 * K * rows);
-        move(
-            begin, rows, x, q, motion, reach, pick, K, spare_weights, w, aligned, has_extras, means_t, quats_t, extras
-        );
+        const Moved to = moved_by(x, q, motion, reach, pick, K, spare_weights, w, aligned, has_extras);
+        to.write(begin, rows, has_extras, means_t, quats_t, extras);
     };
     if (indices.shape[1] == 4)
         run(Four{});

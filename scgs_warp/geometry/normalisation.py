@@ -83,10 +83,8 @@ class Normalisation:
 
     def apply_camera(self, camera: Camera) -> Camera:
         """Return the camera that sees the normalised scene at the same pixels, with depths multiplied by ``scale``."""
-        viewmat = camera.viewmat.double()
-        centre = _on_device(tuple(self.centre), viewmat.device)
-        moved = viewmat.clone()
-        moved[:3, 3] = (viewmat[:3, 3] + viewmat[:3, :3] @ centre) * self.scale
+        shift, factors = _change_of_cameras(tuple(self.centre), self.scale, camera.viewmat.device)
+        moved = (camera.viewmat.double() @ shift) * factors
         return Camera(moved.to(camera.viewmat.dtype), camera.K, camera.width, camera.height)
 
     def undo_camera(self, camera: Camera) -> Camera:
@@ -103,6 +101,15 @@ def _on_device(centre: tuple[float, ...], device: torch.device) -> Tensor:
     """Return the centre, [3] float64. It is kept, because sending it makes the host wait for a GPU."""
     with torch.inference_mode(False):
         return torch.tensor(centre, dtype=torch.float64, device=device)
+
+
+@functools.lru_cache(maxsize=64)
+def _change_of_cameras(centre: tuple[float, ...], scale: float, device: torch.device) -> tuple[Tensor, Tensor]:
+    """Return two [4, 4] float64: the translation to the centre, and the factors by which translations grow."""
+    with torch.inference_mode(False):
+        shift, factors = torch.eye(4, dtype=torch.float64), torch.ones(4, 4, dtype=torch.float64)
+        shift[:3, 3], factors[:3, 3] = torch.tensor(centre, dtype=torch.float64), scale
+        return shift.to(device), factors.to(device)
 
 
 def _rig(cameras: Sequence[Camera]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

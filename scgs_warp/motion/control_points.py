@@ -195,7 +195,7 @@ class ControlPoints(Motion):
     ) -> Gaussians:
         """Move all Gaussians by linear blend skinning (Eq. 6-7). Editing replaces only ``pose``; shading and
         correctives follow the rotations of ``own`` if given, those of the trained motion."""
-        if self._at_once and not self.config.mask:
+        if not (torch.is_grad_enabled() or self.config.mask):
             rotations = (
                 None if own is None else skin(gaussians.means, gaussians.quats, self.positions, own, *binding)[1]
             )

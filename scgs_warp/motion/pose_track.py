@@ -88,8 +88,8 @@ class PoseTrack:
 
 
 def _field(row: Tensor, name: str, columns: slice) -> Tensor:
-    value = row[:, columns]
-    return F.normalize(value, dim=1) if name in TURNS else value.contiguous()
+    value = row[:, columns]  # a turn lies between two that are on the same side, so its norm is not 0
+    return value / torch.linalg.vector_norm(value, dim=1, keepdim=True) if name in TURNS else value.contiguous()
 
 
 def _columns(pose: Pose) -> tuple[dict[str, slice], Tensor]:

@@ -20,7 +20,9 @@ MAX_CHUNKS = 128
 """Largest number of chunks. Each keeps a count per row of tiles, and the counts must not outweigh the splats."""
 
 
-def bin_splats(splats: Splats, tile_size: int = TILE_SIZE, *, demand: Demand | None = None) -> Tiles:
+def bin_splats(
+    splats: Splats, tile_size: int = TILE_SIZE, *, demand: Demand | None = None, slots: bool = True
+) -> Tiles:
     """List, for every tile of the image, the splats that reach one of its pixels, sorted by depth.
 
     A splat reaches the pixels where its alpha is at least 1/255. A splat is left out if its radius is 0, a value is
@@ -32,6 +34,7 @@ def bin_splats(splats: Splats, tile_size: int = TILE_SIZE, *, demand: Demand | N
         tile_size: side of a tile in pixels.
         demand: memory that compositing takes in addition to the lists. If given, an image whose lists do not fit into
             memory is cut into windows, which ``composite`` draws one after the other. None: the lists have to fit.
+        slots: whether to make ``Tiles.slots``, which compositing needs for gradients only; otherwise it is empty.
 
     Returns:
         Tiles on the same device, with ``ranges`` in row-major order. Splat ``i`` owns the slots ``offsets[i]`` up to
@@ -57,7 +60,7 @@ def bin_splats(splats: Splats, tile_size: int = TILE_SIZE, *, demand: Demand | N
         windows = memory_windows.cut(lambda window: _count(splats, size, window), columns, rows, demand, splats)
         empty = torch.empty(0, dtype=torch.int32, device=device)
         return Tiles(empty.view(0, 2), empty, empty, empty.long(), *size, windows=tuple(windows))
-    return _listed(splats, size, count)
+    return _listed(splats, size, count, slots)
 
 
 def bin_window(splats: Splats, tiles: Tiles, window: Window) -> Tiles:
@@ -76,8 +79,10 @@ def _count(splats: Splats, size: tuple[int, ...], window: Window) -> BandBinning
     return counted(geometry_of(splats), size, window)
 
 
-def _listed(splats: Splats, size: tuple[int, int, int, int, int], count: BandBinning | RadixBinning) -> Tiles:
-    tiles = Tiles(*count.lists(), *size)
+def _listed(
+    splats: Splats, size: tuple[int, int, int, int, int], count: BandBinning | RadixBinning, slots: bool = True
+) -> Tiles:
+    tiles = Tiles(*count.lists(slots or debug.enabled()), *size)
     if debug.enabled():
         checks.check_tiles(splats, tiles)
     return tiles
@@ -117,8 +122,8 @@ class BandBinning:
         rows, columns = self._tiles
         return 32 * self._stretches + 4 * self._begins.numel() + 4 * rows * columns
 
-    def lists(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Return ranges, splats, slots and offsets."""
+    def lists(self, with_slots: bool = True) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Return ranges, splats, slots (or [0]) and offsets."""
         count, (rows, columns) = len(self._geometry[0]), self._tiles
         offsets = torch.empty(count + 1, dtype=torch.int64)
         keys, spare = (torch.empty(self._stretches, dtype=torch.int64) for _ in range(2))
@@ -130,7 +135,7 @@ class BandBinning:
         if begun is not None:
             checks.check_dealt(begun, self._begins)
         ranges = torch.empty(rows * columns, 2, dtype=torch.int32)
-        splats, slots = (checks.unwritten(self.pairs) for _ in range(2))
+        splats, slots = checks.unwritten(self.pairs), checks.unwritten(self.pairs if with_slots else 0)
         cursors = torch.empty(rows, columns, dtype=torch.int32)
         tiles, load = (cursors, ranges, splats, slots), self._band_begins[1:]
         launch(kernels.sort_bands, rows, self._band_begins, dealt, before, keys, spare, *tiles, grain=1, load=load)

@@ -74,10 +74,10 @@ class RadixBinning:
     def scratch_bytes(self) -> int:
         return 16 * self.pairs + 12 * len(self._counts)
 
-    def lists(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Return ranges, splats, slots and offsets."""
+    def lists(self, with_slots: bool = True) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Return ranges, splats, slots (or [0]) and offsets."""
         ranked = _ranked(self._counts, self._order)
-        lists = _list(self._geometry, self._size, ranked, self._order, self._offsets, self.pairs, True)
+        lists = _list(self._geometry, self._size, ranked, self._order, self._offsets, self.pairs, with_slots)
         return *lists, self._offsets
 
 

@@ -34,6 +34,7 @@ class _Job:
     stats: Stats | None
     absgrad: Tensor | None
     form: str
+    depth_unit: float | None = None
 
 
 def demand(splats: Splats, channels: Tensor, background: Tensor | None = None) -> Demand:
@@ -61,6 +62,7 @@ def composite(
     *,
     stats: Stats | None = None,
     absgrad: Tensor | None = None,
+    depth_unit: float | None = None,
     form: Form = "auto",
 ) -> tuple[Tensor, Tensor]:
     """Blend the splats of each pixel front to back: sum_i channels_i alpha_i T_i + T background.
@@ -82,6 +84,8 @@ def composite(
         stats: statistics to which the backward pass adds. None: they are not collected.
         absgrad: [N, 2] buffer that the backward pass overwrites with the sum over pixels of the absolute gradients of
             ``means2d``.
+        depth_unit: if given, the last channel is depth: of its blend, divided by alpha (at least 1e-10) and by this
+            unit, the result is the expected depth. Without gradients alone.
         form: kernels to run; ``auto`` takes the fastest for the device. ``pixel`` is the readable reference on any
             device, ``blocks`` the portable sibling of ``cuda``.
 
@@ -96,9 +100,11 @@ def composite(
         background = channels.new_zeros(channels.shape[1])
     else:
         background = background.nan_to_num(0.0, 0.0, 0.0)
-    job = _Job(splats, tiles, stats, absgrad, _resolve_form(form, channels.device, tiles.tile_size))
+    job = _Job(splats, tiles, stats, absgrad, _resolve_form(form, channels.device, tiles.tile_size), depth_unit)
     tensors: tuple[Tensor, ...] = (splats.means2d, splats.conics, splats.opacities, channels, background)
     if torch.is_grad_enabled() and any(t.requires_grad for t in tensors):
+        if depth_unit is not None:
+            raise ValueError("depth_unit is for images without gradients")
         if not tiles.windows and len(tiles.slots) != len(tiles.splats):
             raise ValueError("tiles.slots is empty: these tiles were made for an image without gradients")
         return _Composite.apply(*tensors, job)  # type: ignore[return-value]
@@ -195,6 +201,9 @@ def _forward(job: _Job, tensors: tuple[Tensor, ...], keep: bool) -> tuple[Any, .
         del tiles  # frees its memory before the next window
     if checked:
         checks.check_image(image, channels, background)
+    if job.depth_unit is not None and job.form != "cpu":
+        depth = image[-1].view(-1)
+        launch(kernels.expected_depth, len(depth), depth, alpha.view(-1), job.depth_unit, depth)
     return image, alpha, *((source, transmittance, last) if keep else (None, None, None))
 
 
@@ -212,7 +221,8 @@ def _draw(
     form, begin, count = job.form, window[0], window[1] - window[0]
     if form == "cpu":
         lists, load = (source, background, tiles.ranges, tiles.splats), _load(tiles, window)
-        launch(cpu_kernels.composite, count, *lists, *size, *outputs, grain=1, load=load, begin=begin)
+        unit = job.depth_unit or 0.0
+        launch(cpu_kernels.composite, count, *lists, *size, unit, *outputs, grain=1, load=load, begin=begin)
         return
     lists = (means2d, conics, source, channels, background, tiles.ranges, tiles.splats)
     if form != "pixel":

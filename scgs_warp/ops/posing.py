@@ -1,14 +1,21 @@
-"""Posing without gradients on a GPU: the network's output to a pose, and the pose to Gaussians, in a launch each."""
+"""Posing without gradients: the network's output to a pose, and the pose to Gaussians, in a launch each."""
 
 from __future__ import annotations
+
+from typing import Literal
 
 import torch
 from torch import Tensor
 
 from ..kernels import posing as kernels
+from ..kernels.cpu import posing as cpu_kernels
+from ..kernels.neighbors import MAX_NEIGHBORS
+from ..kernels.types import LANES
 from ..runtime.launch import launch
 from ..types import Pose
-from .skinning import pose_tensors
+from .skinning import pack_palette, pose_tensors
+
+Form = Literal["auto", "plain", "cpu"]
 
 
 def unit_pose(motion: Tensor, heads: dict[str, int]) -> Pose:
@@ -36,6 +43,8 @@ def pose_gaussians(
     indices: Tensor,
     weights: Tensor,
     own: Tensor | None = None,
+    *,
+    form: Form = "auto",
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
     """Move Gaussians by linear blend skinning, apply correctives, tints and shading, and activate them.
 
@@ -47,21 +56,25 @@ def pose_gaussians(
         indices: [N, K] int32 nearest control points of each Gaussian.
         weights: [N, K] their weights; rows sum to 1.
         own: [N, 4] wxyz, any norm: rotations that correctives and shading follow instead of the moved ones.
+        form: kernels to run: ``plain`` on any device, ``cpu`` in SIMD; ``auto`` takes the fastest for the device.
 
     Returns:
         Means, quats, scales, opacities and ``sh_dc``, as ``skin``, ``correct``, ``tint``, ``shade`` and the activations
-        give them; no gradients.
+        give them (on a CPU to the bit); no gradients.
     """
     translations, rotations, shapes, extras = (None if x is None else x.contiguous() for x in pose_tensors(pose))
-    kind = 0 if extras is None else kernels.LOG_SCALES if pose.tints is None else kernels.TINTS
-    own = None if own is None else own.contiguous()
+    kind = int(0 if extras is None else kernels.LOG_SCALES if pose.tints is None else kernels.TINTS)
+    own, count = None if own is None else own.contiguous(), len(rest[0])
+    rest, nodes = tuple(value.detach().contiguous() for value in rest), nodes.detach().contiguous()
+    binding = indices.contiguous(), weights.contiguous(), own, int(own is not None)
     means, quats, scales, opacities, sh_dc = (torch.empty_like(value) for value in rest[:5])
-    launch(
-        kernels.pose_gaussians,
-        len(rest[0]),
-        *(value.detach().contiguous() for value in rest),
-        *(nodes.detach().contiguous(), translations, rotations, rotations if shapes is None else shapes),
-        *(extras, int(kind), indices.contiguous(), weights.contiguous(), own, int(own is not None)),
-        *(means, quats, scales, opacities, sh_dc),
-    )
-    return means, quats, scales, opacities, sh_dc
+    posed = means, quats, scales, opacities, sh_dc
+    if form == "auto":
+        form = "cpu" if nodes.device.type == "cpu" and indices.shape[1] <= MAX_NEIGHBORS else "plain"
+    if form == "cpu":
+        palette = pack_palette(nodes, (translations, rotations, shapes, extras))
+        launch(cpu_kernels.pose_gaussians, -(-count // LANES), *rest, *palette, kind, *binding, *posed, grain=32)
+    else:
+        pose_of_nodes = translations, rotations, rotations if shapes is None else shapes, extras, kind
+        launch(kernels.pose_gaussians, count, *rest, nodes, *pose_of_nodes, *binding, *posed)
+    return posed

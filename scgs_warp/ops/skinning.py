@@ -186,7 +186,7 @@ def pack_palette(nodes: Tensor, pose: tuple, radii=None, strengths=None, hyper=N
         *(extras, int(extras is not None), motion, reach),
         grain=128,
     )
-    return Palette(motion, reach, int(bool((motion[:, 12] > SAME_SIDE).all())))
+    return Palette(motion, reach, int((motion.numpy()[:, 12] > SAME_SIDE).all()))
 
 
 class _SkinRbf(torch.autograd.Function):

@@ -10,8 +10,6 @@ import torch
 from torch import Tensor
 
 from ..kernels import compositing as kernels
-from ..kernels.cpu import compositing as cpu_kernels
-from ..kernels.types import LANES
 from ..ops.binning import bin_splats
 from ..ops.compositing import composite, demand
 from ..ops.harmonics import MAX_DEGREE, colors_and_depths, spherical_harmonics
@@ -48,10 +46,11 @@ def render(
     Raises:
         ValueError: a shape, a size or the degree is wrong.
     """
-    image, alpha = draw(
-        gaussians, camera, background, sh_degree=sh_degree, stats=stats, antialiased=antialiased, depth=True
-    )
-    return Image(image[:3].permute(1, 2, 0), alpha, expected_depth(image[3], alpha, depth_unit))
+    unit = None if torch.is_grad_enabled() else depth_unit
+    settings: dict[str, Any] = {"sh_degree": sh_degree, "stats": stats, "antialiased": antialiased}
+    image, alpha = draw(gaussians, camera, background, **settings, depth=True, depth_unit=unit)
+    depth = expected_depth(image[3], alpha, depth_unit) if unit is None else image[3]
+    return Image(image[:3].permute(1, 2, 0), alpha, depth)
 
 
 def draw(
@@ -63,6 +62,7 @@ def draw(
     stats: Stats | None = None,
     antialiased: bool = False,
     depth: bool = False,
+    depth_unit: float | None = None,
     binned: Callable[[Splats], Tiles] | None = None,
 ) -> tuple[Tensor, Tensor]:
     """Render as :func:`render` does, to planar images, with depth only on request, which saves its cost in training.
@@ -70,6 +70,7 @@ def draw(
     Args:
         background: [3], or with ``depth`` also [4].
         depth: append the depth accumulated over the pixel, in world units times alpha, as a fourth channel.
+        depth_unit: append the expected depth instead, in this unit; without gradients alone.
         binned: function that lists the splats of each tile. None: ``bin_splats``.
 
     Returns:
@@ -94,8 +95,8 @@ def draw(
     if depth and background is not None and len(background) == 3:
         background = torch.cat([background, background.new_zeros(1)])
     beside = demand(splats, channels, background)
-    tiles = bin_splats(splats, demand=beside) if binned is None else binned(splats)
-    return composite(splats, channels, tiles, background, stats=stats)
+    tiles = bin_splats(splats, demand=beside, slots=torch.is_grad_enabled()) if binned is None else binned(splats)
+    return composite(splats, channels, tiles, background, stats=stats, depth_unit=depth_unit)
 
 
 class _FiniteGradient(torch.autograd.Function):
@@ -129,8 +130,5 @@ def expected_depth(accumulated: Tensor, alpha: Tensor, unit: float = 1.0) -> Ten
         return depth if unit == 1.0 else (depth.double() / unit).to(depth.dtype)
     depth = torch.empty_like(alpha)
     pixels = accumulated.contiguous().flatten(), alpha.contiguous().flatten(), unit, depth.view(-1)
-    if accumulated.is_cuda:
-        launch(kernels.expected_depth, depth.numel(), *pixels)
-    else:
-        launch(cpu_kernels.expected_depth, -(-depth.numel() // LANES), *pixels, grain=1024)
+    launch(kernels.expected_depth, depth.numel(), *pixels)
     return depth

@@ -14,6 +14,7 @@ from reference.binning import needed_pairs, usable
 from scgs_warp.ops import binning
 from scgs_warp.ops.binning import BandBinning, bin_splats
 from scgs_warp.ops.binning_cuda import RadixBinning
+from scgs_warp.ops.compositing import composite
 from scgs_warp.runtime import environment
 from scgs_warp.types import Splats, Tiles
 
@@ -143,6 +144,17 @@ def assert_both_sorts_agree(splats: Splats, device: str = "cpu", tile_size: int 
     for name, got, expected in zip(LISTS, BandBinning(geometry, size, whole).lists(), by_radix, strict=True):
         assert torch.equal(got, expected.cpu()), name
     return len(by_radix[1])
+
+
+def test_lists_for_an_image_alone_have_no_slots(device: str):
+    splats = random_splats(4, 300, 90, 70, device)
+    whole, plain = bin_splats(splats), bin_splats(splats, slots=False)
+    assert torch.equal(plain.ranges, whole.ranges) and torch.equal(plain.splats, whole.splats)
+    assert len(plain.slots) == 0 and len(whole.slots) == len(whole.splats) > 500
+    channels = torch.rand(300, 3, device=device, requires_grad=True)
+    with pytest.raises(ValueError, match="made for an image without gradients"):
+        composite(splats, channels, plain)
+    assert torch.equal(composite(splats, channels.detach(), plain)[0], composite(splats, channels, whole)[0].detach())
 
 
 @pytest.mark.parametrize("seed", range(3))

@@ -205,6 +205,29 @@ def test_depths_are_the_same_with_and_without_gradients(unit: float, pixels: int
     torch.testing.assert_close(found.double(), expected, rtol=1e-6, atol=0.0)
 
 
+@pytest.mark.parametrize("channels", [1, 4, 6, 11])
+def test_depth_is_divided_where_it_is_drawn(channels: int, device: str):
+    """The last channel is the expected depth, to the bit; the others and alpha stay as they are."""
+    splats, values = random_splats(21, 12, 70, 45, device), random_channels(21, 12, channels, device)
+    background = torch.cat([torch.rand(channels - 1), torch.zeros(1)]).to(device)
+    tiles = bin_splats(splats)
+    with torch.no_grad():
+        for form in forms(device):
+            image, alpha = composite(splats, values, tiles, background, form=form)  # type: ignore[arg-type]
+            for unit in (1.0, 0.3):
+                found, same = composite(splats, values, tiles, background, depth_unit=unit, form=form)  # type: ignore
+                expected = image[-1].double() / alpha.double().clamp_min(1e-10) / unit
+                torch.testing.assert_close(found[-1].double(), expected, rtol=1e-6, atol=0.0)
+                assert torch.equal(found[:-1], image[:-1]) and torch.equal(same, alpha)
+    assert float((alpha == 0).sum()) > 0 and float(found[-1][alpha == 0].abs().max()) == 0.0
+
+
+def test_an_expected_depth_has_no_gradient():
+    splats, channels = random_splats(12, 100, 40, 40), random_channels(12, 100, 4).requires_grad_()
+    with pytest.raises(ValueError, match="depth_unit is for images without gradients"):
+        composite(splats, channels, bin_splats(splats), depth_unit=1.0)
+
+
 def test_threads_change_nothing(all_threads: None):
     splats, channels = random_splats(10, 3000, 200, 150), random_channels(10, 3000, 4)
     results = []

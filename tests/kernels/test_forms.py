@@ -14,7 +14,10 @@ from helpers.paths import ROOT, TESTS  # isort: skip
 
 COLUMNS = ("portable", "cpu", "cuda", "compared in")
 FOLDERS = {"portable": "", "cpu": "cpu/", "cuda": "cuda/"}
-RENAMED = ("adam", "compositing", "correctives", "harmonics", "neighbors", "projection", "shading", "skinning", "ssim")
+RENAMED = (
+    *("adam", "compositing", "correctives", "harmonics", "neighbors"),
+    *("posing", "projection", "shading", "skinning", "ssim"),
+)
 """Stages whose forms have the same names for the same kernels."""
 
 

@@ -9,6 +9,8 @@ from torch.nn.functional import normalize
 from reference.correctives import correct
 from reference.shading import shade, tint
 from reference.skinning import skin
+from scgs_warp.ops import correctives, shading, skinning
+from scgs_warp.ops.activations import exponential, sigmoid
 from scgs_warp.ops.posing import pose_gaussians, unit_pose
 from scgs_warp.types import Pose
 
@@ -74,10 +76,14 @@ def twin(rest, nodes: torch.Tensor, pose: Pose, indices, weights, own=None) -> t
     return moved, turned, log_scales.exp(), logits.sigmoid(), sh_dc
 
 
+def forms(device: str) -> list[str]:
+    return ["plain", "cpu"] if device == "cpu" else ["plain"]
+
+
 @pytest.mark.parametrize("edited", [False, True])
 @pytest.mark.parametrize(("corrected", "shaded"), [(False, False), (True, False), (False, True), (True, True)])
 @pytest.mark.parametrize("heads", HEADS.values(), ids=HEADS)
-@pytest.mark.parametrize(("count", "k"), [(1, 1), (257, 4)])
+@pytest.mark.parametrize(("count", "k"), [(1, 1), (257, 4), (40, 5)])
 def test_gaussians_are_those_of_the_parts(count, k, heads, corrected, shaded, edited, device):
     rest, nodes = rest_of(count, corrected, shaded), torch.randn(20, 3, generator=torch.Generator().manual_seed(7))
     pose = unit_pose(0.7 * motion_of(heads, 20, "cpu"), heads)
@@ -93,16 +99,52 @@ def test_gaussians_are_those_of_the_parts(count, k, heads, corrected, shaded, ed
         None if own is None else own.double(),
     )
     there = Pose(**{name: None if value is None else value.to(device) for name, value in vars(pose).items()})
-    found = pose_gaussians(
-        tuple(x.to(device) for x in rest),
-        nodes.to(device),
-        there,
-        *(x.to(device) for x in binding),
-        None if own is None else own.to(device),
-    )
-    for name, a, b in zip(("means", "quats", "scales", "opacities", "sh_dc"), found, expected, strict=True):
-        assert a.device.type == device
-        torch.testing.assert_close(a.cpu().double(), b, rtol=1e-4, atol=2e-5, msg=lambda m, name=name: f"{name}: {m}")
+    on_device = tuple(x.to(device) for x in rest), nodes.to(device), there, *(x.to(device) for x in binding)
+    for form in forms(device):
+        found = pose_gaussians(*on_device, None if own is None else own.to(device), form=form)
+        for name, a, b in zip(("means", "quats", "scales", "opacities", "sh_dc"), found, expected, strict=True):
+            assert a.device.type == device
+            where = f"{form}, {name}"
+            torch.testing.assert_close(
+                a.cpu().double(), b, rtol=1e-4, atol=2e-5, msg=lambda m, where=where: f"{where}: {m}"
+            )
+
+
+def test_nothing_is_posed_by_what_is_not_finite(device):
+    """A broken Gaussian stays one: its neighbours in the same vector do not change."""
+    heads = HEADS["tints"]
+    rest, nodes = rest_of(35, True, True), torch.randn(20, 3, generator=torch.Generator().manual_seed(7)).to(device)
+    rest, binding = [x.to(device) for x in rest], [x.to(device) for x in binding_of(35, 20, 4)]
+    pose = unit_pose(0.7 * motion_of(heads, 20, device), heads)
+    sound = pose_gaussians(tuple(rest), nodes, pose, *binding)
+    broken = [x.clone() for x in rest]
+    for number, value in enumerate(broken):
+        value[17 + number % 3] = float("nan") if number % 2 else float("inf")
+    others = torch.tensor([i for i in range(35) if not 17 <= i <= 19], device=device)
+    for form in forms(device):
+        for a, b in zip(pose_gaussians(tuple(broken), nodes, pose, *binding, form=form), sound, strict=True):
+            torch.testing.assert_close(a[others], b[others], rtol=1e-4, atol=2e-5)
+
+
+@pytest.mark.parametrize("edited", [False, True])
+@pytest.mark.parametrize("heads", [HEADS["tints"], HEADS["official"]], ids=["tints", "official"])
+@torch.no_grad()
+def test_one_pass_has_the_bits_of_its_parts(heads, edited):
+    """Frames are drawn in one pass, training steps in parts: what is trained is what is shown."""
+    rest, nodes = rest_of(257, True, True), torch.randn(20, 3, generator=torch.Generator().manual_seed(7))
+    pose, binding = unit_pose(0.7 * motion_of(heads, 20, "cpu"), heads), binding_of(257, 20, 4)
+    own = torch.randn(257, 4, generator=torch.Generator().manual_seed(8)) if edited else None
+    means, quats, log_scales, logits, sh_dc, matrices, gains = rest
+    moved, turned, extras = skinning.skin(means, quats, nodes, pose, *binding)
+    moved = correctives.correct(moved, matrices, quats, turned, own)
+    if pose.tints is None:
+        log_scales = log_scales + extras
+    else:
+        sh_dc = shading.tint(sh_dc, extras)
+    sh_dc = shading.shade(sh_dc, gains, quats, turned if own is None else own)
+    parts = moved, turned, exponential(log_scales), sigmoid(logits), sh_dc
+    found = pose_gaussians(tuple(rest), nodes, pose, *binding, own)
+    assert all(torch.equal(a, b) for a, b in zip(found, parts, strict=True))
 
 
 def test_nothing_to_pose(device):
