@@ -32,7 +32,21 @@ def network_block(
 ): ...
 
 
+@native_function("network.h")
+def pair_products(found: wp.array[int]): ...
+
+
 # fmt: on
+
+
+@wp.kernel
+def find_pair_products(
+    first: int,
+    # Out:
+    found_out: wp.array[int],  # [1]
+):
+    """Write how this processor adds products of two bfloat16: 0 one by one, 1 in pairs, 2 in tiles too. Grid: 1."""
+    pair_products(found_out)
 
 
 @wp.kernel

@@ -20,15 +20,15 @@ def pack_panel_pairs(layer: int, panel: int, table: wp.array2d[wp.int64], packed
 
 @native_function("network_pairs.h")
 def network_block_adjoint_pairs(
-    block: int, size: int, first: int, table: wp.array2d[wp.int64], packed: wp.array[int], inputs: wp.array3d[float],
-    hidden: wp.array3d[float], v_out: wp.array2d[float], columns: wp.array3d[int], input_rows: wp.array3d[int],
-    hidden_rows: wp.array3d[int], v_rows: wp.array3d[int],
+    block: int, size: int, first: int, tiles: int, table: wp.array2d[wp.int64], packed: wp.array[int],
+    inputs: wp.array3d[float], hidden: wp.array3d[float], v_out: wp.array2d[float], columns: wp.array3d[int],
+    input_rows: wp.array3d[int], hidden_rows: wp.array3d[int], v_rows: wp.array3d[int],
 ): ...
 
 
 @native_function("network_pairs.h")
 def network_panel_adjoint_pairs(
-    layer: int, panel: int, part: int, parts: int, first: int, count: int, table: wp.array2d[wp.int64],
+    layer: int, panel: int, part: int, parts: int, first: int, count: int, tiles: int, table: wp.array2d[wp.int64],
     input_rows: wp.array3d[int], hidden_rows: wp.array3d[int], v_rows: wp.array3d[int],
 ): ...
 # fmt: on
@@ -54,6 +54,7 @@ def network_adjoint_pairs(
     # In:
     size: int,  # rows a block
     begin: int,  # the first of the V rows
+    tiles: int,  # whether to use AMX
     table_in: wp.array2d[wp.int64],  # [L, 9]
     packed_in: wp.array[int],
     inputs_in: wp.array3d[float],  # [panels, R, 32]
@@ -68,7 +69,7 @@ def network_adjoint_pairs(
 ):
     """Propagate gradients back through all layers for a block of rows, and pair the rows. Grid: blocks."""
     network_block_adjoint_pairs(
-        first + wp.tid(), size, begin, table_in, packed_in, inputs_in, hidden_in, v_values_in,
+        first + wp.tid(), size, begin, tiles, table_in, packed_in, inputs_in, hidden_in, v_values_in,
         columns_tmp, input_rows_out, hidden_rows_out, v_rows_out
     )  # fmt: skip
 
@@ -81,6 +82,7 @@ def network_weights_adjoint_pairs(
     parts: int,  # tasks that share a panel of outputs
     begin: int,  # the first of the V rows
     count: int,  # how many of them count
+    tiles: int,  # whether to use AMX
     table_in: wp.array2d[wp.int64],  # [L, 9]
     input_rows_in: wp.array3d[int],  # [panels, V / 2, 32]
     hidden_rows_in: wp.array3d[int],  # [L - 1, V / 2, width]
@@ -94,5 +96,6 @@ def network_weights_adjoint_pairs(
     layer = task // (panels * parts)
     rest = task - layer * panels * parts
     network_panel_adjoint_pairs(
-        layer, rest // parts, rest % parts, parts, begin, count, table_in, input_rows_in, hidden_rows_in, v_rows_in
+        layer, rest // parts, rest % parts, parts, begin, count, tiles,
+        table_in, input_rows_in, hidden_rows_in, v_rows_in
     )  # fmt: skip

@@ -1,6 +1,14 @@
 // A small multilayer perceptron: packing of its weights and inputs, and its evaluation.
 #pragma once
-#include "network_panels.h"
+#include "network_tiles.h"
+
+static inline void pair_products(wp::array_t<int>& found) {
+#if defined(__AVX512BF16__)
+    found.data[0] = 1 + HAS_TILES;
+#else
+    found.data[0] = 0;
+#endif
+}
 
 // Pack one panel of a layer's weights, in the layout that each of its products reads; for the adjoint of the layer
 // before only if asked.

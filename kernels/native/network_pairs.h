@@ -4,7 +4,9 @@
 // Gradients are stored twice: paired by columns, as the adjoint of the values reads them (columns j and j + LANES of a
 // strip), and paired by rows, as that of the weights does.
 #pragma once
-#include "network_panels.h"
+#include "network_tiles.h"
+#include "simd.h"
+#include "shuffles.h"
 
 typedef unsigned vp __attribute__((vector_size(LANES * 4)));
 typedef unsigned vpu __attribute__((vector_size(LANES * 4), aligned(4)));
@@ -92,7 +94,7 @@ static inline void pack_panel_pairs(
 // Propagate the gradients of a block of rows back through all layers, and pair the rows of gradients, hidden values and
 // inputs for the adjoint of the weights. ``columns`` holds the gradients of two layers.
 WHOLE_REGISTERS static inline void network_block_adjoint_pairs(
-    int block, int size, int first, const wp::array_t<wp::int64>& table, const wp::array_t<int>& packed,
+    int block, int size, int first, int tiles, const wp::array_t<wp::int64>& table, const wp::array_t<int>& packed,
     const wp::array_t<float>& inputs, const wp::array_t<float>& hidden, const wp::array_t<float>& v_out,
     wp::array_t<int>& columns, wp::array_t<int>& input_rows, wp::array_t<int>& hidden_rows, wp::array_t<int>& v_rows
 ) {
@@ -123,6 +125,17 @@ WHOLE_REGISTERS static inline void network_block_adjoint_pairs(
                 for (int c = 0; c < PANEL; c += STRIP)
                     store_columns(by_columns + r * PAIRS, c, *(vnu*)&v[r][c], *(vnu*)&v[r][c + LANES]);
         }
+    alignas(64) float zeros[PANEL * PANEL] = {}, products[PANEL * PANEL];
+    // Return the gradients of a panel's columns, for ROWS rows from i on, before the ReLU.
+    auto multiply = [&](auto& acc, const unsigned* from, const unsigned* right, int reads, int i) {
+        for (int r = 0; r < ROWS; ++r)
+            for (int v = 0; v < VECTORS; ++v)
+                acc[r][v] = tiles ? *(vnu*)(products + (i - begin + r) * PANEL + v * LANES) : vn{};
+        for (int k = 0; k < reads && !tiles; ++k) {
+            const unsigned* left = from + ((long long)k * own_rows + i) * PAIRS;
+            accumulate(acc, left, HalfPanel(), One(), right + (long long)k * PAIRS * PANEL, PAIRS);
+        }
+    };
     for (int l = layers - 1; l > 0; --l) {
         const long long* own = (const long long*)table.data + (long long)l * TABLE_COLUMNS;
         const int reads = panels(own[OUTPUTS]);
@@ -131,14 +144,18 @@ WHOLE_REGISTERS static inline void network_block_adjoint_pairs(
             for (int c = 0; c < PANEL; c += STRIP) {
                 const unsigned* right =
                     (unsigned*)packed.data + own[PACKED_ADJOINT] / 2 + (long long)p * reads * PAIRS * PANEL + c;
+                if (tiles) {
+                    const Tiles registers = {};
+                    registers.begin(zeros);
+                    for (int k = 0; k < reads; ++k)
+                        registers.add(
+                            from + ((long long)k * own_rows + begin) * PAIRS, right + (long long)k * PAIRS * PANEL
+                        );
+                    registers.end(products);
+                }
                 for (int i = begin; i < end; i += ROWS) {
                     vn acc[ROWS][VECTORS], h[ROWS][VECTORS];
-                    for (int r = 0; r < ROWS; ++r)
-                        for (int v = 0; v < VECTORS; ++v) acc[r][v] = vn{};
-                    for (int k = 0; k < reads; ++k) {
-                        const unsigned* left = from + ((long long)k * own_rows + i) * PAIRS;
-                        accumulate(acc, left, HalfPanel(), One(), right + (long long)k * PAIRS * PANEL, PAIRS);
-                    }
+                    multiply(acc, from, right, reads, i);
                     const float* value = hidden.data + plane * (l - 1) + ((long long)p * rows + first + i) * PANEL + c;
                     for (int r = 0; r < ROWS; ++r)
                         for (int v = 0; v < VECTORS; ++v) {
@@ -160,10 +177,49 @@ WHOLE_REGISTERS static inline void network_block_adjoint_pairs(
     }
 }
 
+// Copy the part of 32 x 32 numbers that exists between two matrices with ``from_stride`` and ``to_stride`` columns.
+static inline void copy_part(
+    const float* from, long long from_stride, float* to, long long to_stride, int rows, int columns
+) {
+    for (int j = 0; j < rows; ++j)
+        for (int c = 0; c < columns; ++c) to[j * to_stride + c] = from[j * from_stride + c];
+}
+
+// Compute 32 x 32 gradients of weights by tiles: the sums over pairs of rows of v times x, PANEL apart. If ``first``,
+// the sums continue those at ``gradient``, of which ``rows`` x ``columns`` exist.
+static inline void tiled_gradients(
+    const unsigned* v, const unsigned* x, int pairs, int first, float* gradient, long long stride, int rows, int columns
+) {
+    alignas(64) float sums[PANEL * PANEL] = {};
+    alignas(64) unsigned left[PANEL * SIDE], rest[SIDE * PANEL];
+    if (first) copy_part(gradient, stride, sums, PANEL, rows, columns);
+    const Tiles registers = {};
+    registers.begin(sums);
+    for (int i = 0; i < pairs; i += SIDE) {
+        const int own = pairs - i < SIDE ? pairs - i : SIDE;
+        for (int half = 0; half < PANEL; half += SIDE) {  // rows of pairs become columns
+            vf turned[SIDE];
+            for (int k = 0; k < SIDE; ++k)
+                turned[k] = k < own ? load((const float*)v + (i + k) * PANEL + half, 16) : vf{};
+            transpose(turned);
+            __builtin_memcpy(left + half * SIDE, turned, sizeof(turned));
+        }
+        const unsigned* right = x + (long long)i * PANEL;
+        if (own < SIDE) {  // what lies behind may be anything
+            __builtin_memset(rest, 0, sizeof(rest));
+            __builtin_memcpy(rest, right, own * PANEL * sizeof(unsigned));
+            right = rest;
+        }
+        registers.add(left, right);
+    }
+    registers.end(sums);
+    copy_part(sums, PANEL, gradient, stride, rows, columns);
+}
+
 // Compute the gradients of the weights [out, in] and biases of one panel of a layer's outputs. The sums over the rows
 // of ``v_rows`` continue those over the rows before ``first``.
 WHOLE_REGISTERS static inline void network_panel_adjoint_pairs(
-    int layer, int panel, int part, int parts, int first, int count, const wp::array_t<wp::int64>& table,
+    int layer, int panel, int part, int parts, int first, int count, int tiles, const wp::array_t<wp::int64>& table,
     const wp::array_t<int>& input_rows, const wp::array_t<int>& hidden_rows, const wp::array_t<int>& v_rows
 ) {
     const auto accumulate = pair_accumulation();
@@ -195,6 +251,10 @@ WHOLE_REGISTERS static inline void network_panel_adjoint_pairs(
                                             (long long)(q - before) * own_rows * PAIRS;
         const int column = of_inputs ? q * PANEL : from_inputs + (q - before) * PANEL;
         const int n = of_inputs && from_inputs - column < PANEL ? from_inputs - column : PANEL;
+        if (tiles) {
+            tiled_gradients(v, x, pairs, first, gradient + (long long)panel * PANEL * in + column, in, n_out, n);
+            continue;
+        }
         for (int j = 0; j < n_out; j += ROWS)
             for (int c = 0; c < n; c += STRIP) {
                 vn acc[ROWS][VECTORS];

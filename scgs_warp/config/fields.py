@@ -102,7 +102,7 @@ class MotionConfig:
     bfloat16: bool = False
     """Compute the hidden layers in bfloat16 while training."""
     bfloat16_adjoint: bool = newer(True, before=False)
-    """On a CPU, round the factors of the network's gradients to bfloat16; sums stay in float32."""
+    """On a CPU with AVX512-BF16, round the factors of the network's gradients to bfloat16; sums stay in float32."""
     plane_times: int = bounded(0, 0, 4_096)
     """Number of texels of the feature planes along t; 0: half the number of training times (4D-GS)."""
 

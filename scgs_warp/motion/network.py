@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 
 from ..ops.encoding import encode_rows
-from ..ops.network import Layers, PackedLayers, evaluate, network, supported
+from ..ops.network import Layers, PackedLayers, evaluate, network, pair_products, supported
 from ..runtime.environment import one_piece
 
 
@@ -153,7 +153,8 @@ class DeformationNetwork(nn.Module):
         if (self.low_precision and self.training) or wants_inputs or not supported(weights, biases):
             return None
         if self.training or torch.is_grad_enabled():
-            return network(where, when, weights, biases, bfloat16=self.low_precision_adjoint)
+            rounded = self.low_precision_adjoint and pair_products() > 0
+            return network(where, when, weights, biases, bfloat16=rounded)
         columns = where.shape[1] + when.shape[1]
         packed = self._packed((*weights, *biases), lambda: Layers(weights, biases, columns))
         return evaluate(packed, where, when)

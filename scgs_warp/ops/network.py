@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Iterable
 from typing import Any
 
@@ -13,6 +14,7 @@ from ..kernels.cpu import network_adjoint as kernels_adjoint
 from ..kernels.cpu import network_pairs as kernels_pairs
 from ..kernels.types import NETWORK_BLOCK, NETWORK_PANEL
 from ..runtime.launch import launch
+from ..runtime.matrix_tiles import may_use_tiles
 
 ROW_MULTIPLE = 8
 """Number to a multiple of which the rows of every matrix are rounded up."""
@@ -22,6 +24,17 @@ ADJOINT_ROWS_AT_ONCE = 2048
 """Number of rows of the adjoint evaluated at once; it does not affect the result."""
 PARTS = 2
 """Number of tasks that share a panel of a layer's weight gradients."""
+
+
+@functools.cache
+def pair_products() -> int:
+    """Return how the processor adds products of bfloat16: 0 singly, 1 in pairs (AVX512-BF16), 2 in tiles (AMX), too.
+
+    Singly, rounding the factors of gradients takes longer than it saves.
+    """
+    found = torch.zeros(1, dtype=torch.int32)
+    launch(kernels.find_pair_products, 1, found)
+    return min(int(found), 2 if may_use_tiles() else 1)
 
 
 class Layers:
@@ -128,7 +141,8 @@ class Layers:
     def _backward_in_pairs(self, table: Tensor, inputs: Tensor, hidden: Tensor, v_out: Tensor) -> None:
         """Write the gradients of the parameters, from factors in bfloat16, to the table's addresses."""
         layers, rows, width = hidden.shape
-        most = min(rows, ADJOINT_ROWS_AT_ONCE)
+        # Whole blocks: a tile of registers holds rows behind the last one, which count nowhere.
+        most, tiles = -(-min(rows, ADJOINT_ROWS_AT_ONCE) // NETWORK_BLOCK) * NETWORK_BLOCK, int(pair_products() > 1)
         columns, input_rows, hidden_rows, v_rows = (
             torch.empty(shape, dtype=torch.int32)
             for shape in (
@@ -140,10 +154,10 @@ class Layers:
         )
         for begin in range(0, rows, ADJOINT_ROWS_AT_ONCE):
             own = min(ADJOINT_ROWS_AT_ONCE, rows - begin)
-            read = NETWORK_BLOCK, begin, table, self.pairs, inputs, hidden, v_out
+            read = NETWORK_BLOCK, begin, tiles, table, self.pairs, inputs, hidden, v_out
             pairs = input_rows, hidden_rows, v_rows
             launch(kernels_pairs.network_adjoint_pairs, -(-own // NETWORK_BLOCK), *read, columns, *pairs, grain=1)
-            shared = self.panels, PARTS, begin, min(own, len(v_out) - begin), table, *pairs
+            shared = self.panels, PARTS, begin, min(own, len(v_out) - begin), tiles, table, *pairs
             launch(kernels_pairs.network_weights_adjoint_pairs, layers * self.panels * PARTS, *shared, grain=1)
 
 

@@ -6,10 +6,11 @@ from torch import Tensor
 
 from reference.network import gradients_in_bfloat16
 from reference.network import network as twin
+from scgs_warp.motion import network as motion_network
 from scgs_warp.motion.network import DeformationNetwork
 from scgs_warp.ops import network as ops
 from scgs_warp.ops.network import Layers, evaluate, network, supported
-from scgs_warp.runtime import environment
+from scgs_warp.runtime import environment, matrix_tiles
 
 SHAPES = [  # inputs of position and time, hidden widths, layers that read the inputs again, outputs
     (63, 13, [256] * 8, {4}, 7),
@@ -56,9 +57,18 @@ def test_values_and_gradients(shape, positions, times, seed):
         assert float((got.double() - want).norm() / want.norm().clamp_min(1e-6)) < 2e-3
 
 
+@pytest.fixture(params=[1, 2], ids=["pairs", "tiles"])
+def products(request, monkeypatch) -> int:
+    """Products of bfloat16 in pairs, and in tiles where the processor has them."""
+    if request.param == 2 and ops.pair_products() < 2:
+        pytest.skip("needs AMX")
+    monkeypatch.setattr(ops, "pair_products", lambda: request.param)
+    return request.param
+
+
 @pytest.mark.parametrize("positions, times", [(1, 1), (7, 1), (13, 3), (70, 1)])
 @pytest.mark.parametrize("shape", SHAPES)
-def test_gradients_of_factors_in_bfloat16(shape, positions, times):
+def test_gradients_of_factors_in_bfloat16(shape, positions, times, products):
     """Ten times closer to the twin that rounds than to the one that does not."""
     weights, biases = parameters(shape, 3)
     where, when = rows(shape, positions, times, 3)
@@ -91,8 +101,45 @@ def test_with_a_gradient_of_the_inputs_nothing_is_rounded():
     assert all(torch.equal(a, b) for a, b in zip(*results))
 
 
+@pytest.mark.parametrize("found", [0, 1, 2])
+def test_factors_are_rounded_where_that_saves_time(found, monkeypatch):
+    """Not on a processor that multiplies bfloat16 one by one."""
+    asked: list[bool] = []
+    monkeypatch.setattr(motion_network, "pair_products", lambda: found)
+    monkeypatch.setattr(motion_network, "network", lambda *a, bfloat16: asked.append(bfloat16) or network(*a))
+    for wanted in (False, True):
+        model = DeformationNetwork({"translations": 3}, width=32, bfloat16_adjoint=wanted)
+        model(torch.rand(5, 3), torch.rand(2))
+    assert asked == [False, found > 0]
+
+
+def test_tiles_need_linux_on_x86(monkeypatch):
+    for name, value in (("platform", "darwin"), ("platform", "win32")):
+        monkeypatch.setattr(matrix_tiles.sys, name, value)
+        assert not matrix_tiles.may_use_tiles.__wrapped__()
+    monkeypatch.undo()
+    monkeypatch.setattr(matrix_tiles.platform, "machine", lambda: "aarch64")
+    assert not matrix_tiles.may_use_tiles.__wrapped__()
+
+
+@pytest.mark.parametrize("refused", [-1, None])
+def test_tiles_need_permission(refused, monkeypatch):
+    class Library:
+        @staticmethod
+        def syscall(*arguments: int) -> int:
+            assert arguments == (158, 0x1023, 18)
+            if refused is None:
+                raise OSError
+            return refused
+
+    monkeypatch.setattr(matrix_tiles.sys, "platform", "linux")
+    monkeypatch.setattr(matrix_tiles.platform, "machine", lambda: "x86_64")
+    monkeypatch.setattr(matrix_tiles.ctypes, "CDLL", lambda name: Library)
+    assert not matrix_tiles.may_use_tiles.__wrapped__()
+
+
 @pytest.mark.parametrize("bad", [float("nan"), float("inf"), -float("inf")])
-def test_a_gradient_that_is_not_finite_is_not_hidden_by_rounding(bad):
+def test_a_gradient_that_is_not_finite_is_not_hidden_by_rounding(bad, products):
     weights, biases = parameters(SHAPES[1], 15)
     where, when = rows(SHAPES[1], 9, 1, 15)
     found = network(where, when, weights, biases, bfloat16=True)
@@ -120,7 +167,7 @@ def test_inputs_without_a_gradient_cost_nothing_and_change_no_bit(monkeypatch):
 
 @pytest.mark.parametrize("bfloat16", [False, True])
 @pytest.mark.parametrize("largest", [32, 64])
-def test_the_adjoint_in_parts_gives_the_same_bits(largest, bfloat16, monkeypatch):
+def test_the_adjoint_in_parts_gives_the_same_bits(largest, bfloat16, monkeypatch, products):
     weights, biases = parameters(SHAPES[2], 13)
     where, when = rows(SHAPES[2], 51, 2, 13)
     where.requires_grad_(not bfloat16)
@@ -152,7 +199,7 @@ def test_without_gradient_in_parts_and_packed_gives_the_same_bits():
 
 
 @pytest.mark.parametrize("bfloat16", [False, True])
-def test_same_bits_on_any_number_of_threads(bfloat16):
+def test_same_bits_on_any_number_of_threads(bfloat16, products):
     weights, biases = parameters(SHAPES[0], 4)
     where, when = rows(SHAPES[0], 101, 3, 4)
     where.requires_grad_(not bfloat16)
