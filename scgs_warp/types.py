@@ -145,7 +145,8 @@ class Tiles:
     splats: Tensor
     """[P] int32, splat index of each (tile, splat) pair, sorted by tile, then depth."""
     slots: Tensor
-    """[P] int32, emission index of each pair: the slot that its gradient is written to."""
+    """[P] int32, emission index of each pair: the slot that its gradient is written to. [0]: made for an image without
+    gradients."""
     offsets: Tensor
     """[N + 1] int64, splat i owns the slots from ``offsets[i]`` up to ``offsets[i + 1]``."""
     width: int

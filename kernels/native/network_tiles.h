@@ -1,7 +1,8 @@
 // Products of matrices of bfloat16 pairs by the tile registers of AMX (Intel, since Sapphire Rapids).
 //
 // Tiles 0 to 3 hold 32 x 32 sums in float32, tiles 4 and 5 hold 32 rows of 16 pairs of the left factor, tiles 6 and 7
-// hold 16 rows of 32 pairs of the right one. A tile adds the products of pairs in their order.
+// hold 16 rows of 32 pairs of the right one. A tile adds the products of 16 pairs in an order of its own,
+// so sums over rows depend on how the rows are cut into 16 pairs.
 #pragma once
 #include "network_panels.h"
 

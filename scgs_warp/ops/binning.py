@@ -34,7 +34,8 @@ def bin_splats(
         tile_size: side of a tile in pixels.
         demand: memory that compositing takes in addition to the lists. If given, an image whose lists do not fit into
             memory is cut into windows, which ``composite`` draws one after the other. None: the lists have to fit.
-        slots: whether to make ``Tiles.slots``, which compositing needs for gradients only; otherwise it is empty.
+        slots: whether to make ``Tiles.slots``, which compositing needs for gradients only; otherwise it is empty,
+            except in debug mode.
 
     Returns:
         Tiles on the same device, with ``ranges`` in row-major order. Splat ``i`` owns the slots ``offsets[i]`` up to

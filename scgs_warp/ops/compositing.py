@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -93,9 +94,11 @@ def composite(
         image [C, H, W] on the background, alpha [H, W] in [0, 1).
 
     Raises:
-        ValueError: a shape or the form is wrong.
+        ValueError: a shape, the form or the unit is wrong.
     """
     _validate(splats, channels, tiles, background, stats, absgrad)
+    if depth_unit is not None and not 0.0 < depth_unit < math.inf:
+        raise ValueError(f"depth_unit must be positive and finite, got {depth_unit}")
     if background is None:
         background = channels.new_zeros(channels.shape[1])
     else:
@@ -200,7 +203,9 @@ def _forward(job: _Job, tensors: tuple[Tensor, ...], keep: bool) -> tuple[Any, .
             checks.check_pixels(tiles, window, alpha, transmittance, last)
         del tiles  # frees its memory before the next window
     if checked:
-        checks.check_image(image, channels, background)
+        # The expected depth of a pixel that hardly anything covers may overflow.
+        colors = image if job.depth_unit is None else image[:-1]
+        checks.check_image(colors, channels, background)
     if job.depth_unit is not None and job.form != "cpu":
         depth = image[-1].view(-1)
         launch(kernels.expected_depth, len(depth), depth, alpha.view(-1), job.depth_unit, depth)

@@ -21,7 +21,7 @@ ROW_MULTIPLE = 8
 ROWS_AT_ONCE = 8192
 """Number of rows evaluated at once without gradients: hidden values stay in the cache from layer to layer."""
 ADJOINT_ROWS_AT_ONCE = 2048
-"""Number of rows of the adjoint evaluated at once; it does not affect the result."""
+"""Number of rows of the adjoint evaluated at once. A multiple of 32, it does not affect the result."""
 PARTS = 2
 """Number of tasks that share a panel of a layer's weight gradients."""
 

@@ -13,7 +13,9 @@ from ..kernels.neighbors import MAX_NEIGHBORS
 from ..kernels.types import LANES
 from ..runtime.launch import launch
 from ..types import Pose
-from .skinning import pack_palette, pose_tensors
+from .correctives import COLUMNS as CORRECTIVE_COLUMNS
+from .shading import COLUMNS as SHADING_COLUMNS
+from .skinning import check_inputs, pack_palette, pose_tensors
 
 Form = Literal["auto", "plain", "cpu"]
 
@@ -60,8 +62,15 @@ def pose_gaussians(
 
     Returns:
         Means, quats, scales, opacities and ``sh_dc``, as ``skin``, ``correct``, ``tint``, ``shade`` and the activations
-        give them (on a CPU to the bit); no gradients.
+        give them (form ``cpu`` to the bit); no gradients.
+
+    Raises:
+        ValueError: a shape is wrong, or there are more neighbours than the form takes.
     """
+    check_inputs(rest[0], rest[1], nodes, pose, indices, weights)
+    _check_rest(rest, own)
+    if form == "cpu" and indices.shape[1] > MAX_NEIGHBORS:
+        raise ValueError(f"form cpu takes up to {MAX_NEIGHBORS} neighbours, got {indices.shape[1]}")
     translations, rotations, shapes, extras = (None if x is None else x.contiguous() for x in pose_tensors(pose))
     kind = int(0 if extras is None else kernels.LOG_SCALES if pose.tints is None else kernels.TINTS)
     own, count = None if own is None else own.contiguous(), len(rest[0])
@@ -78,3 +87,12 @@ def pose_gaussians(
         pose_of_nodes = translations, rotations, rotations if shapes is None else shapes, extras, kind
         launch(kernels.pose_gaussians, count, *rest, nodes, *pose_of_nodes, *binding, *posed)
     return posed
+
+
+def _check_rest(rest: tuple[Tensor, ...], own: Tensor | None) -> None:
+    count, names = len(rest[0]), ("log_scales", "opacity_logits", "sh_dc", "correctives", "shading", "own")
+    correctives, shading = ([(count, width), (count, 0)] for width in (CORRECTIVE_COLUMNS, SHADING_COLUMNS))
+    shapes = [(count, 3)], [(count,)], [(count, 3)], correctives, shading, [(count, 4)]
+    for name, value, allowed in zip(names, (*rest[2:], own), shapes, strict=True):
+        if value is not None and tuple(value.shape) not in allowed:
+            raise ValueError(f"{name} must be {' or '.join(str([*x]) for x in allowed)}, got {tuple(value.shape)}")

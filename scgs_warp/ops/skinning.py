@@ -89,7 +89,14 @@ def _check_shapes(expected: dict[str, tuple[Tensor | None, tuple[int, ...]]]) ->
             raise ValueError(f"{name} must be {list(shape)}, got {tuple(value.shape)}")
 
 
-def _validate(means: Tensor, quats: Tensor, nodes: Tensor, pose: Pose, indices: Tensor, weights: Tensor | None) -> None:
+def check_inputs(
+    means: Tensor, quats: Tensor, nodes: Tensor, pose: Pose, indices: Tensor, weights: Tensor | None
+) -> None:
+    """Check the shapes that :func:`skin` declares.
+
+    Raises:
+        ValueError: a shape is wrong, or the pose has both log scales and tints.
+    """
     if means.ndim != 2 or means.shape[1] != 3:
         raise ValueError(f"means must be [N, 3], got {tuple(means.shape)}")
     if nodes.ndim != 2 or nodes.shape[1] != 3:
@@ -146,7 +153,7 @@ def skin(
     Raises:
         ValueError: a shape is wrong.
     """
-    _validate(means, quats, nodes, pose, indices, weights)
+    check_inputs(means, quats, nodes, pose, indices, weights)
     floats = means, quats, nodes, *pose_tensors(pose), weights
     values = [None if value is None else value.contiguous() for value in floats]
     indices = indices.contiguous()
@@ -278,7 +285,7 @@ def skin_rbf(
     if (hyper_points is None) != (hyper_nodes is None):
         raise ValueError("hyper_points and hyper_nodes must be given together")
     width = 0 if hyper_points is None else hyper_points.shape[-1]
-    _validate(means, quats, nodes, pose, indices, None)
+    check_inputs(means, quats, nodes, pose, indices, None)
     total, count = means.shape[0], nodes.shape[0]
     expected = {
         "radii": (radii, (count,)),

@@ -128,9 +128,10 @@ def rasterization(
         background = None if backgrounds is None else backgrounds[index]
         channels, background = _channels(own, means, camera, splat, sh_degree, render_mode, background)
         buffer = meta["means2d"].absgrad[index] if absgrad else None
-        tiles = bin_splats(splat, demand=demand(splat, channels, background))
-        image, alpha = composite(splat, channels, tiles, background, absgrad=buffer)
-        if render_mode.endswith("ED"):
+        tiles = bin_splats(splat, demand=demand(splat, channels, background), slots=torch.is_grad_enabled())
+        unit = 1.0 if render_mode.endswith("ED") and not torch.is_grad_enabled() else None
+        image, alpha = composite(splat, channels, tiles, background, absgrad=buffer, depth_unit=unit)
+        if render_mode.endswith("ED") and unit is None:
             image = torch.cat([image[:-1], expected_depth(image[-1], alpha)[None]])
         renders.append(image.permute(1, 2, 0))
         alphas.append(alpha[..., None])

@@ -41,7 +41,8 @@ def render(
 
     Returns:
         Image: ``rgb`` [H, W, 3] (its planar permutation is contiguous), ``alpha`` [H, W], ``depth`` [H, W] along the
-        camera's z. Gradients reach ``gaussians``, ``camera.viewmat`` and ``background``.
+        camera's z. Colour and depth share their memory. Gradients reach ``gaussians``, ``camera.viewmat`` and
+        ``background``.
 
     Raises:
         ValueError: a shape, a size or the degree is wrong.
@@ -70,12 +71,14 @@ def draw(
     Args:
         background: [3], or with ``depth`` also [4].
         depth: append the depth accumulated over the pixel, in world units times alpha, as a fourth channel.
-        depth_unit: append the expected depth instead, in this unit; without gradients alone.
+        depth_unit: with ``depth``, append the expected depth instead, in this unit; without gradients alone.
         binned: function that lists the splats of each tile. None: ``bin_splats``.
 
     Returns:
         image [3 or 4, H, W] and alpha [H, W].
     """
+    if depth_unit is not None and not depth:
+        raise ValueError("depth_unit needs depth=True")
     if background is not None and tuple(background.shape) not in ((3,), (3 + depth,)):
         raise ValueError(f"background must be [3], got {tuple(background.shape)}")
     if sh_degree is None:

@@ -15,7 +15,7 @@ from scgs_warp.ops import binning
 from scgs_warp.ops.binning import BandBinning, bin_splats
 from scgs_warp.ops.binning_cuda import RadixBinning
 from scgs_warp.ops.compositing import composite
-from scgs_warp.runtime import environment
+from scgs_warp.runtime import debug, environment
 from scgs_warp.types import Splats, Tiles
 
 
@@ -150,7 +150,10 @@ def test_lists_for_an_image_alone_have_no_slots(device: str):
     splats = random_splats(4, 300, 90, 70, device)
     whole, plain = bin_splats(splats), bin_splats(splats, slots=False)
     assert torch.equal(plain.ranges, whole.ranges) and torch.equal(plain.splats, whole.splats)
-    assert len(plain.slots) == 0 and len(whole.slots) == len(whole.splats) > 500
+    assert len(whole.slots) == len(whole.splats) > 500
+    if debug.enabled():
+        return  # the lists are made whole, to be checked
+    assert len(plain.slots) == 0
     channels = torch.rand(300, 3, device=device, requires_grad=True)
     with pytest.raises(ValueError, match="made for an image without gradients"):
         composite(splats, channels, plain)

@@ -222,6 +222,13 @@ def test_depth_is_divided_where_it_is_drawn(channels: int, device: str):
     assert float((alpha == 0).sum()) > 0 and float(found[-1][alpha == 0].abs().max()) == 0.0
 
 
+@pytest.mark.parametrize("unit", [0.0, -2.0, float("nan"), float("inf")])
+def test_a_unit_of_depth_is_positive(unit: float):
+    splats, channels = random_splats(12, 100, 40, 40), random_channels(12, 100, 4)
+    with pytest.raises(ValueError, match="depth_unit must be positive and finite"):
+        composite(splats, channels, bin_splats(splats), depth_unit=unit)
+
+
 def test_an_expected_depth_has_no_gradient():
     splats, channels = random_splats(12, 100, 40, 40), random_channels(12, 100, 4).requires_grad_()
     with pytest.raises(ValueError, match="depth_unit is for images without gradients"):

@@ -113,13 +113,43 @@ def test_factors_are_rounded_where_that_saves_time(found, monkeypatch):
     assert asked == [False, found > 0]
 
 
+class Kernel:
+    """A system that lets every program use tiles."""
+
+    @staticmethod
+    def syscall(*arguments: int) -> int:
+        assert arguments == (158, 0x1023, 18)
+        return 0
+
+
 def test_tiles_need_linux_on_x86(monkeypatch):
+    monkeypatch.setattr(matrix_tiles.ctypes, "CDLL", lambda name: Kernel)
+    monkeypatch.setattr(matrix_tiles.sys, "platform", "linux")
+    monkeypatch.setattr(matrix_tiles.platform, "machine", lambda: "x86_64")
+    assert matrix_tiles.may_use_tiles.__wrapped__() is True
     for name, value in (("platform", "darwin"), ("platform", "win32")):
         monkeypatch.setattr(matrix_tiles.sys, name, value)
         assert not matrix_tiles.may_use_tiles.__wrapped__()
-    monkeypatch.undo()
+    monkeypatch.setattr(matrix_tiles.sys, "platform", "linux")
     monkeypatch.setattr(matrix_tiles.platform, "machine", lambda: "aarch64")
     assert not matrix_tiles.may_use_tiles.__wrapped__()
+
+
+def test_tiles_are_used_where_there_are_some(monkeypatch):
+    """They add in another order than pairs: some bit differs."""
+    found = torch.zeros(1, dtype=torch.int32)
+    ops.launch(ops.kernels.find_pair_products, 1, found)
+    if int(found) < 2 or not matrix_tiles.may_use_tiles():
+        pytest.skip("needs AMX")
+    assert ops.pair_products() == 2
+    weights, biases = parameters(SHAPES[0], 21)
+    where, when = rows(SHAPES[0], 70, 1, 21)
+    gradients = []
+    for products in (2, 1):
+        monkeypatch.setattr(ops, "pair_products", lambda products=products: products)
+        out = network(where, when, weights, biases, bfloat16=True)
+        gradients.append(torch.autograd.grad(out.square().sum(), (*weights, *biases)))
+    assert any(not torch.equal(a, b) for a, b in zip(*gradients, strict=True))
 
 
 @pytest.mark.parametrize("refused", [-1, None])

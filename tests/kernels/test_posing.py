@@ -127,24 +127,55 @@ def test_nothing_is_posed_by_what_is_not_finite(device):
 
 
 @pytest.mark.parametrize("edited", [False, True])
-@pytest.mark.parametrize("heads", [HEADS["tints"], HEADS["official"]], ids=["tints", "official"])
+@pytest.mark.parametrize("heads", HEADS.values(), ids=HEADS)
+@pytest.mark.parametrize("turns", [0.05, 0.7], ids=["aligned", "large"])
+@pytest.mark.parametrize(("count", "k"), [(257, 4), (33, 1), (15, 5)])
 @torch.no_grad()
-def test_one_pass_has_the_bits_of_its_parts(heads, edited):
+def test_one_pass_has_the_bits_of_its_parts(count, k, turns, heads, edited):
     """Frames are drawn in one pass, training steps in parts: what is trained is what is shown."""
-    rest, nodes = rest_of(257, True, True), torch.randn(20, 3, generator=torch.Generator().manual_seed(7))
-    pose, binding = unit_pose(0.7 * motion_of(heads, 20, "cpu"), heads), binding_of(257, 20, 4)
-    own = torch.randn(257, 4, generator=torch.Generator().manual_seed(8)) if edited else None
+    rest, nodes = rest_of(count, True, True), torch.randn(20, 3, generator=torch.Generator().manual_seed(7))
+    pose, binding = unit_pose(turns * motion_of(heads, 20, "cpu"), heads), binding_of(count, 20, k)
+    own = torch.randn(count, 4, generator=torch.Generator().manual_seed(8)) if edited else None
     means, quats, log_scales, logits, sh_dc, matrices, gains = rest
     moved, turned, extras = skinning.skin(means, quats, nodes, pose, *binding)
     moved = correctives.correct(moved, matrices, quats, turned, own)
-    if pose.tints is None:
+    if pose.log_scales is not None:
         log_scales = log_scales + extras
-    else:
+    if pose.tints is not None:
         sh_dc = shading.tint(sh_dc, extras)
     sh_dc = shading.shade(sh_dc, gains, quats, turned if own is None else own)
     parts = moved, turned, exponential(log_scales), sigmoid(logits), sh_dc
     found = pose_gaussians(tuple(rest), nodes, pose, *binding, own)
     assert all(torch.equal(a, b) for a, b in zip(found, parts, strict=True))
+
+
+def test_what_does_not_fit_is_refused(device):
+    heads = HEADS["tints"]
+    rest = tuple(x.to(device) for x in rest_of(20, True, True))
+    nodes, pose = torch.zeros(8, 3, device=device), unit_pose(motion_of(heads, 8, device), heads)
+    indices, weights = (x.to(device) for x in binding_of(20, 8, 4))
+    both = Pose(pose.translations, pose.rotations, log_scales=pose.tints, tints=pose.tints)
+    refused = [
+        ("pose.translations must be", (rest, torch.zeros(9, 3, device=device), pose, indices, weights)),
+        ("weights must be", (rest, nodes, pose, indices, weights[:, :2])),
+        ("not both", (rest, nodes, both, indices, weights)),
+        ("own must be", (rest, nodes, pose, indices, weights, rest[1][:5])),
+    ]
+    for number, name in ((2, "log_scales"), (3, "opacity_logits"), (4, "sh_dc"), (5, "correctives"), (6, "shading")):
+        short = [x[:-1] if i == number else x for i, x in enumerate(rest)]
+        refused.append((f"{name} must be", (tuple(short), nodes, pose, indices, weights)))
+    for text, arguments in refused:
+        with pytest.raises(ValueError, match=text):
+            pose_gaussians(*arguments)
+
+
+def test_the_cpus_form_takes_16_neighbours():
+    heads = HEADS["control points"]
+    pose, rest = unit_pose(motion_of(heads, 20, "cpu"), heads), tuple(rest_of(3, True, True))
+    binding = binding_of(3, 20, 17)
+    with pytest.raises(ValueError, match="up to 16 neighbours, got 17"):
+        pose_gaussians(rest, torch.zeros(20, 3), pose, *binding, form="cpu")
+    assert len(pose_gaussians(rest, torch.zeros(20, 3), pose, *binding)[0]) == 3
 
 
 def test_nothing_to_pose(device):
