@@ -30,7 +30,7 @@ PARTS = 2
 def pair_products() -> int:
     """Return how the processor adds products of bfloat16: 0 singly, 1 in pairs (AVX512-BF16), 2 in tiles (AMX), too.
 
-    Singly, rounding the factors of gradients takes longer than it saves.
+    Singly, rounding the factors of gradients saves no time.
     """
     found = torch.zeros(1, dtype=torch.int32)
     launch(kernels.find_pair_products, 1, found)
