@@ -14,12 +14,6 @@ static inline void pose_block(
     int has_own, wp::array_t<wp::vec3>& means_t, wp::array_t<wp::vec4>& quats_t, wp::array_t<wp::vec3>& scales_t,
     wp::array_t<float>& opacities_t, wp::array_t<wp::vec3>& sh_dc_t
 ) {
-    struct Any {
-        enum { value = 0 };
-    };
-    struct Four {
-        enum { value = 4 };
-    };
     auto run = [&](auto kc) __attribute__((always_inline)) {
         const int K = decltype(kc)::value ? decltype(kc)::value : indices.shape[1];
         const int rows = means.shape[0] - begin < 16 ? means.shape[0] - begin : 16;
@@ -61,8 +55,5 @@ static inline void pose_block(
         store(opacities_t.data + begin, opacity, rows);
         write_vectors(sh_dc_t.data, begin, rows, 3, color);
     };
-    if (indices.shape[1] == 4)
-        run(Four{});
-    else
-        run(Any{});
+    by_count()(indices.shape[1], run);
 }

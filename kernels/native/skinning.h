@@ -59,12 +59,6 @@ static inline void skin(
     wp::array_t<wp::vec3>& extras
 ) {
     FUSE_WITHIN_EXPRESSIONS
-    struct Any {
-        enum { value = 0 };
-    };
-    struct Four {
-        enum { value = 4 };
-    };
     auto run = [&](auto kc) __attribute__((always_inline)) {
         const int K = decltype(kc)::value ? decltype(kc)::value : indices.shape[1];
         const int rows = means.shape[0] - begin < 16 ? means.shape[0] - begin : 16;
@@ -80,10 +74,7 @@ static inline void skin(
         const Moved to = moved_by(x, q, motion, reach, pick, K, weight, columns, aligned, has_extras);
         to.write(begin, rows, has_extras, means_t, quats_t, extras);
     };
-    if (indices.shape[1] == 4)
-        run(Four{});
-    else
-        run(Any{});
+    by_count()(indices.shape[1], run);
 }
 
 // Compute RBF weights, write them, and skin with them.
@@ -94,12 +85,6 @@ static inline void skin_rbf(
     wp::array_t<wp::vec4>& quats_t, wp::array_t<wp::vec3>& extras
 ) {
     FUSE_WITHIN_EXPRESSIONS
-    struct Any {
-        enum { value = 0 };
-    };
-    struct Four {
-        enum { value = 4 };
-    };
     const int H = has_hyper ? hyper.shape[1] : 0;
     const float infinity = __builtin_inff();
     auto run = [&](auto kc) __attribute__((always_inline)) {
@@ -140,8 +125,5 @@ static inline void skin_rbf(
         const Moved to = moved_by(x, q, motion, reach, pick, K, spare_weights, w, aligned, has_extras);
         to.write(begin, rows, has_extras, means_t, quats_t, extras);
     };
-    if (indices.shape[1] == 4)
-        run(Four{});
-    else
-        run(Any{});
+    by_count()(indices.shape[1], run);
 }

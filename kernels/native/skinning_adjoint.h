@@ -28,12 +28,6 @@ static inline void skin_rbf_adjoint(
     wp::array_t<float>& v_hyper, wp::array_t<float>& v_motion, wp::array_t<float>& v_reach
 ) {
     FUSE_WITHIN_EXPRESSIONS
-    struct Any {
-        enum { value = 0 };
-    };
-    struct Four {
-        enum { value = 4 };
-    };
     const int N = means.shape[0], H = has_hyper ? hyper.shape[1] : 0;
     const vi upper = lane_numbers() >= 12.0f;
     const int M = motion.shape[0];
@@ -173,9 +167,6 @@ static inline void skin_rbf_adjoint(
     };
     const int end = (chunk + 1) * size < N ? (chunk + 1) * size : N;
     for (int begin = chunk * size; begin < end; begin += 16) {
-        if (indices.shape[1] == 4)
-            run(Four{}, begin);
-        else
-            run(Any{}, begin);
+        by_count()(indices.shape[1], [&](auto kc) __attribute__((always_inline)) { run(kc, begin); });
     }
 }

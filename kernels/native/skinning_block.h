@@ -7,6 +7,23 @@
 
 typedef float v4 __attribute__((vector_size(16), aligned(4)));
 
+// Return a function that calls run(K): with a type that holds the usual four neighbours, so that loops over them are
+// unrolled, or with one that holds 0 and leaves the number open.
+static inline auto by_count() {
+    struct Any {
+        enum { value = 0 };
+    };
+    struct Four {
+        enum { value = 4 };
+    };
+    return [](int neighbors, auto run) __attribute__((always_inline)) {
+        if (neighbors == 4)
+            run(Four{});
+        else
+            run(Any{});
+    };
+}
+
 // Load one column for each hyper-coordinate, with zeros behind the last.
 ALWAYS_INLINE void read_hyper(const wp::array_t<float>& hyper, int H, int begin, int rows, vf* to) {
     if (!H) return;
