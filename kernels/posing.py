@@ -1,4 +1,5 @@
-"""Posing without gradients: skinning, correctives, tints, shading and activations of a Gaussian in one launch.
+"""Posing: the network's output to a pose, with its adjoint; and skinning, correctives, tints, shading and activations
+of a Gaussian in one launch, without one.
 
 A frame on a GPU is many small kernels, so its time is that of their number. Training runs the kernels of the parts,
 which have adjoints.
@@ -7,7 +8,7 @@ which have adjoints.
 import warp as wp
 
 from .correctives import corrected
-from .quaternion import quat_multiply, quat_normalise
+from .quaternion import quat_multiply, quat_normalise, quat_normalise_adjoint
 from .shading import shaded, tinted
 from .skinning import skinned
 
@@ -18,10 +19,15 @@ LOG_SCALES, TINTS = wp.constant(1), wp.constant(2)
 
 
 @wp.func
+def from_identity(motion: wp.array2d[float], m: int, column: int) -> wp.vec4:
+    """Return the identity plus four columns."""
+    return wp.vec4(1.0 + motion[m, column], motion[m, column + 1], motion[m, column + 2], motion[m, column + 3])
+
+
+@wp.func
 def near_identity(motion: wp.array2d[float], m: int, column: int) -> wp.vec4:
     """Return the unit quaternion of the identity plus four columns."""
-    raw = wp.vec4(1.0 + motion[m, column], motion[m, column + 1], motion[m, column + 2], motion[m, column + 3])
-    return quat_normalise(raw)
+    return quat_normalise(from_identity(motion, m, column))
 
 
 @wp.kernel
@@ -29,8 +35,8 @@ def unit_pose(
     first: int,
     # In:
     motion_in: wp.array2d[float],  # [M, C] the network's output
-    rotation: int,  # the column at which each part begins; -1: it is not there
-    translation: int,
+    translation: int,  # the column at which each part begins; -1: it is not there
+    rotation: int,
     shape_rotation: int,
     extra: int,
     # Out:
@@ -49,6 +55,48 @@ def unit_pose(
         shape_rotations_out[m] = near_identity(motion_in, m, shape_rotation)
     if extra >= 0:
         extras_out[m] = wp.vec3(motion_in[m, extra], motion_in[m, extra + 1], motion_in[m, extra + 2])
+
+
+@wp.func
+def write_quaternion_gradient(
+    motion: wp.array2d[float], m: int, column: int, v_unit: wp.vec4, v_motion: wp.array2d[float]
+):
+    """Write the gradient of four columns from that of their unit quaternion."""
+    v_raw = quat_normalise_adjoint(from_identity(motion, m, column), v_unit)
+    for k in range(4):
+        v_motion[m, column + k] = v_raw[k]
+
+
+@wp.kernel
+def unit_pose_adjoint(
+    first: int,
+    # In:
+    motion_in: wp.array2d[float],  # [M, C] the network's output
+    translation: int,  # the column at which each part begins; -1: it has no gradient
+    rotation: int,
+    shape_rotation: int,
+    extra: int,
+    v_translations_in: wp.array[wp.vec3],  # [M]; each of the four is touched only with its column
+    v_rotations_in: wp.array[wp.vec4],  # [M]
+    v_shape_rotations_in: wp.array[wp.vec4],  # [M]
+    v_extras_in: wp.array[wp.vec3],  # [M]
+    # Out:
+    v_motion_out: wp.array2d[float],  # [M, C]
+):
+    """Compute the gradient of a row of the network's output. Grid: M."""
+    m = first + wp.tid()
+    for c in range(v_motion_out.shape[1]):
+        v_motion_out[m, c] = 0.0
+    if translation >= 0:
+        for k in range(3):
+            v_motion_out[m, translation + k] = v_translations_in[m][k]
+    if rotation >= 0:
+        write_quaternion_gradient(motion_in, m, rotation, v_rotations_in[m], v_motion_out)
+    if shape_rotation >= 0:
+        write_quaternion_gradient(motion_in, m, shape_rotation, v_shape_rotations_in[m], v_motion_out)
+    if extra >= 0:
+        for k in range(3):
+            v_motion_out[m, extra + k] = v_extras_in[m][k]
 
 
 @wp.kernel

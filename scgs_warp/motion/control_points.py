@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import cache
 
 import torch
 import torch.nn.functional as F
@@ -62,17 +61,6 @@ def make_network(config: MotionConfig, heads: dict[str, int], seed: int) -> Defo
         )
 
     return make(0) if config.chunks == 1 else ChunkedNetwork(make, config.chunks)
-
-
-def unit_rotations(raw: Tensor) -> Tensor:
-    """Convert network output [..., 4] to unit quaternions near the identity."""
-    return F.normalize(raw + _identity(raw.device, raw.dtype), dim=-1)
-
-
-@cache
-def _identity(device: torch.device, dtype: torch.dtype) -> Tensor:
-    with torch.inference_mode(False):
-        return torch.eye(1, 4, device=device, dtype=dtype)
 
 
 def _posed(
@@ -142,25 +130,7 @@ class ControlPoints(Motion):
         """Return one :class:`Pose` per time, from one network evaluation. The network's input is detached, because
         gradients through the encoding's high octaves would make the control points oscillate."""
         positions, times = self.positions.detach(), sent(times, self.positions.device)
-        if self._at_once:
-            return [unit_pose(motion, self.network.heads) for motion in self.network.motion(positions, times)]
-        out = self.network(positions, times)
-        rotations = unit_rotations(out["rotations"])
-        shape = unit_rotations(out["shape_rotations"]) if "shape_rotations" in out else None
-        optional = shape, out.get("log_scales"), out.get("tints")
-        return [
-            Pose(
-                out["translations"][i].contiguous(),
-                rotations[i].contiguous(),
-                *(None if value is None else value[i].contiguous() for value in optional),
-            )
-            for i in range(times.shape[0])
-        ]
-
-    @property
-    def _at_once(self) -> bool:
-        """Whether poses are made in few launches, without gradients."""
-        return self.positions.is_cuda and not torch.is_grad_enabled()
+        return [unit_pose(motion, self.network.heads) for motion in self.network.motion(positions, times).unbind()]
 
     def _hyper(self, gaussians: GaussianParameters) -> Tensor:
         """Return the Gaussians' hyper-coordinates [N, H], without the mask's logit."""

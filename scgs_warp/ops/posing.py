@@ -1,8 +1,8 @@
-"""Posing without gradients: the network's output to a pose, and the pose to Gaussians, in a launch each."""
+"""Posing: the network's output to a pose, and, without gradients, the pose to Gaussians, in a launch each."""
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Any, Literal
 
 import torch
 from torch import Tensor
@@ -20,22 +20,45 @@ from .skinning import check_inputs, pack_palette, pose_tensors
 Form = Literal["auto", "plain", "cpu"]
 
 
+class _UnitPose(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, motion: Tensor, columns: tuple[int, ...]):
+        widths = 3, 4, 4, 3
+        parts = [None if at < 0 else motion.new_empty(len(motion), width) for at, width in zip(columns, widths)]
+        launch(kernels.unit_pose, len(motion), motion, *columns, *parts)
+        ctx.save_for_backward(motion)
+        ctx.columns = columns
+        ctx.set_materialize_grads(False)
+        return tuple(parts)
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, *gradients):  # type: ignore[override]
+        (motion,) = ctx.saved_tensors
+        columns = tuple(-1 if v is None else at for at, v in zip(ctx.columns, gradients))
+        v_parts = [None if v is None else v.contiguous() for v in gradients]
+        v_motion = torch.empty_like(motion)
+        launch(kernels.unit_pose_adjoint, len(motion), motion, *columns, *v_parts, v_motion)
+        return v_motion, None
+
+
 def unit_pose(motion: Tensor, heads: dict[str, int]) -> Pose:
     """Split the output of the deformation network into a pose.
 
     Args:
         motion: [M, C] output. Its quaternions are differences from the identity.
         heads: the numbers of columns of the pose's fields, in their order.
+
+    Returns:
+        The pose, with gradients to ``motion``. A quaternion of norm 0 becomes the identity, without a gradient.
     """
     starts, at = {}, 0
     for name, width in heads.items():
         starts[name], at = at, at + width
     extras = "tints" if "tints" in heads else "log_scales"
-    columns = [starts.get(name, -1) for name in ("rotations", "translations", "shape_rotations", extras)]
-    fields = {name: motion.new_empty(len(motion), width) for name, width in heads.items()}
-    outputs = [fields.get(name) for name in ("translations", "rotations", "shape_rotations", extras)]
-    launch(kernels.unit_pose, len(motion), motion.contiguous(), *columns, *outputs)
-    return Pose(**fields)
+    fields = "translations", "rotations", "shape_rotations", extras
+    columns = tuple(starts.get(name, -1) for name in fields)
+    return Pose(**dict(zip(fields, _UnitPose.apply(motion.contiguous(), columns))))  # type: ignore[arg-type]
 
 
 def pose_gaussians(

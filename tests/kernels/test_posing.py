@@ -41,6 +41,35 @@ def test_the_networks_output_becomes_a_pose(heads, nodes, device):
             torch.testing.assert_close(value.double(), parts[name], rtol=1e-6, atol=1e-6)
 
 
+@pytest.mark.parametrize("heads", HEADS.values(), ids=HEADS)
+@pytest.mark.parametrize("used", [None, *range(4)], ids=["all", "translations", "rotations", "shapes", "extras"])
+def test_gradients_of_a_pose_reach_the_networks_output(heads, used, device):
+    fields = [field for field in ("translations", "rotations", "shape_rotations", "log_scales", "tints")]
+    fields = fields if used is None else [fields[used], *fields[used + 1 : used + 2] * (used == 3)]
+    fields = [field for field in fields if field in heads]
+    mix = {field: torch.randn(60, heads[field], generator=torch.Generator().manual_seed(4)) for field in fields}
+    if not fields:
+        pytest.skip("the network has no such head")
+    motion = motion_of(heads, 60, device).requires_grad_()
+    pose = unit_pose(motion, heads)
+    sum((getattr(pose, field) * mix[field].to(device)).sum() for field in fields).backward()
+    exact = motion.detach().cpu().double().requires_grad_()
+    parts = dict(zip(heads, exact.split(list(heads.values()), dim=1)))
+    for name in ("rotations", "shape_rotations"):
+        if name in parts:
+            parts[name] = normalize(parts[name] + torch.tensor([1.0, 0.0, 0.0, 0.0]), dim=1)
+    sum((parts[field] * mix[field].double()).sum() for field in fields).backward()
+    torch.testing.assert_close(motion.grad.cpu().double(), exact.grad, rtol=1e-5, atol=1e-5)
+
+
+def test_a_rotation_that_vanishes_has_no_gradient(device):
+    motion = torch.tensor([[-1.0, 0, 0, 0, 0, 0, 0], [0.5, 0, 0, 1, 0, 0, 0]], device=device, requires_grad=True)
+    unit_pose(motion, HEADS["control points"]).rotations[:, 3].sum().backward()
+    assert motion.grad is not None
+    assert motion.grad[0].tolist() == [0.0] * 7
+    assert motion.grad[1, 3] > 0
+
+
 def test_a_rotation_that_vanishes_is_the_identity(device):
     motion = torch.zeros(2, 7, device=device)
     motion[0, 0] = -1.0
