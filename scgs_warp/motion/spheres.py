@@ -2,18 +2,39 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from torch import Tensor, nn
 
 from ..config.presets import LossConfig, TrainConfig
 from ..gaussians import GaussianParameters
 from ..runtime.device_copies import sent
+from ..runtime.environment import one_piece
 from ..seeding import generator
 from ..types import Gaussians
 from .base import Motion, MotionStep, TrainingPose, network_rate
 from .chunks import ChunkedNetwork
 from .network import DeformationNetwork
 from .rigidity import Graph, arap_times, build_graph, momentary_graph, rigidity
+
+
+class _Scales(torch.autograd.Function):
+    """Scales [n, 3] of n spheres from the logarithm of their radius [1, 1]. The gradient is one sum in one thread,
+    because the adjoint of torch's expand sums in an order that depends on the number of threads."""
+
+    @staticmethod
+    def forward(ctx: Any, log_radius: Tensor, count: int) -> Tensor:
+        scales = log_radius.exp().expand(count, 3).contiguous()
+        ctx.save_for_backward(scales)
+        return scales
+
+    @staticmethod
+    @torch.autograd.function.once_differentiable
+    def backward(ctx: Any, v_scales: Tensor):  # type: ignore[override]
+        (scales,) = ctx.saved_tensors
+        with one_piece():
+            return (v_scales * scales).sum(dtype=torch.float64).float().view(1, 1), None
 
 
 class Spheres(Motion):
@@ -34,9 +55,7 @@ class Spheres(Motion):
         return self.network(positions.detach(), sent(times, positions.device))["translations"]
 
     def _spheres_at(self, gaussians: GaussianParameters, means: Tensor) -> Gaussians:
-        # The adjoint of a product with ones sums in a fixed order; that of expand does not.
-        ones = torch.ones(len(gaussians), 1, device=means.device)
-        scales = (ones @ self.log_radius.exp()).expand(-1, 3)
+        scales: Tensor = _Scales.apply(self.log_radius, len(gaussians))  # type: ignore[assignment]
         quats, colors = gaussians.quats.detach(), (gaussians.sh_dc, gaussians.sh_rest)
         return Gaussians(means, quats, scales, gaussians.opacities(), *colors, gaussians.sharpness)
 
