@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import functools
 from collections.abc import Callable, Iterable
-from typing import Any
+from typing import Any, NamedTuple
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -22,6 +23,7 @@ ROWS_AT_ONCE = 8192
 """Number of rows evaluated at once without gradients: hidden values stay in the cache from layer to layer."""
 ADJOINT_ROWS_AT_ONCE = 2048
 """Number of rows of the adjoint evaluated at once. A multiple of 32, it does not affect the result."""
+FLOAT_BYTES = 4
 PARTS = 2
 """Number of tasks that share a panel of a layer's weight gradients."""
 
@@ -35,6 +37,37 @@ def pair_products() -> int:
     found = torch.zeros(1, dtype=torch.int32)
     launch(kernels.find_pair_products, 1, found)
     return min(int(found), 2 if may_use_tiles() else 1)
+
+
+class Layout(NamedTuple):
+    """Where the layers' weights and gradients are in memory; it depends on their shapes alone."""
+
+    table: np.ndarray
+    """[layers, 9] int64, as the kernels read it, without addresses."""
+    packed: int
+    """Number of packed values."""
+    gradients: np.ndarray
+    """[layers] byte at which each layer's gradients begin: those of the weights, then those of the biases."""
+    sizes: list[int]
+    """Numbers of weights and of biases of each layer in turn."""
+
+
+@functools.lru_cache(maxsize=32)
+def _layout(shapes: tuple[tuple[int, int], ...], inputs: int, inputs_adjoint: bool) -> Layout:
+    """Lay out layers of ``shapes`` (out, in); the other arguments are those of :class:`Layers`."""
+    rows, sizes, at, before = [], [], 0, 0
+    for out, columns in shapes:
+        own = columns - before
+        panels = -(-out // NETWORK_PANEL)
+        adjoint = at + panels * NETWORK_PANEL * columns
+        to_inputs = adjoint + before * panels * NETWORK_PANEL
+        wanted = inputs_adjoint and own > 0
+        rows.append([0, 0, own, before, out, at, adjoint if before else -1, to_inputs if wanted else -1, 0])
+        at = to_inputs + (-(-own // NETWORK_PANEL) * NETWORK_PANEL * out if wanted else 0)
+        sizes += [out * columns, out]
+        before = out
+    begins = np.cumsum([0, *sizes])[:-1:2] * FLOAT_BYTES
+    return Layout(np.array(rows, np.int64), at, begins, sizes)
 
 
 class Layers:
@@ -61,28 +94,16 @@ class Layers:
         self.inputs = inputs
         self.panels = max(-(-w.shape[0] // NETWORK_PANEL) for w in weights)
         self.outputs = weights[-1].shape[0]
-        self.gradient_begin: list[int] = []
-        rows, at, behind, before = [], 0, 0, 0
-        for layer, weight in enumerate(self.weights):
-            out, columns = weight.shape
-            own = columns - before
-            panels = -(-out // NETWORK_PANEL)
-            adjoint = at + panels * NETWORK_PANEL * columns
-            to_inputs = adjoint + before * panels * NETWORK_PANEL
-            own_row = [weight.data_ptr(), self.biases[layer].data_ptr(), own, before, out, at]
-            wanted = inputs_adjoint and own > 0
-            rows.append([*own_row, adjoint if before else -1, to_inputs if wanted else -1, 0])
-            at = to_inputs + (-(-own // NETWORK_PANEL) * NETWORK_PANEL * out if wanted else 0)
-            self.gradient_begin.append(behind)
-            behind += out * columns + out
-            before = out
-        self.gradient_size = behind
-        self.table = torch.tensor(rows, dtype=torch.int64)
-        self.packed = torch.empty(at)
+        shapes = tuple((out, columns) for out, columns in (w.shape for w in weights))
+        self.layout = _layout(shapes, inputs, inputs_adjoint)
+        table = self.layout.table.copy()
+        table[:, 0], table[:, 1] = [w.data_ptr() for w in weights], [b.data_ptr() for b in biases]
+        self.table = torch.from_numpy(table)
+        self.packed = torch.empty(self.layout.packed)
         widest = max(self.panels, -(-inputs // NETWORK_PANEL)) if inputs_adjoint else self.panels
-        self.pairs = torch.empty(at // 2 if bfloat16 and not inputs_adjoint else 0, dtype=torch.int32)
+        self.pairs = torch.empty(self.layout.packed // 2 if bfloat16 and not inputs_adjoint else 0, dtype=torch.int32)
         """Weights in pairs of bfloat16, for the adjoint; empty: it is computed in float32."""
-        paired, tasks = len(self.pairs) > 0, len(rows) * widest
+        paired, tasks = len(self.pairs) > 0, len(weights) * widest
         launch(kernels.pack_weights, tasks, widest, int(not paired), self.table, self.packed, grain=1)
         if paired:
             launch(kernels_pairs.pack_weight_pairs, tasks, widest, self.table, self.pairs, grain=1)
@@ -108,9 +129,10 @@ class Layers:
             sizes: M, T and A of ``where`` [M, A] at T times. None: the gradient of ``where`` is not needed.
         """
         count = v_out.shape[0]
-        flat = torch.zeros(self.gradient_size) if count == 0 else torch.empty(self.gradient_size)
-        table = self.table.clone()
-        table[:, 8] = torch.tensor(self.gradient_begin) * flat.element_size() + flat.data_ptr()
+        flat = (torch.empty if count else torch.zeros)(sum(self.layout.sizes))
+        rows = self.table.numpy().copy()
+        rows[:, 8] = self.layout.gradients + flat.data_ptr()
+        table = torch.from_numpy(rows)
         v_inputs = None if sizes is None else torch.empty(count, sizes[2])
         if len(self.pairs):
             assert v_inputs is None
@@ -118,12 +140,8 @@ class Layers:
         else:
             self._backward(table, inputs, hidden, v_out, v_inputs)
         v_where = None if v_inputs is None or sizes is None else _over_times(v_inputs, *sizes)
-        weights, biases = [], []
-        for start, weight in zip(self.gradient_begin, self.weights):
-            end = start + weight.numel()
-            weights.append(flat[start:end].view_as(weight))
-            biases.append(flat[end : end + weight.shape[0]])
-        return v_where, weights + biases
+        parts = flat.split(self.layout.sizes)
+        return v_where, [*(v.view_as(w) for v, w in zip(parts[::2], self.weights)), *parts[1::2]]
 
     def _backward(self, table: Tensor, inputs: Tensor, hidden: Tensor, v_out: Tensor, v_inputs: Tensor | None) -> None:
         """Write the gradients of the parameters to the table's addresses, and those of the inputs to ``v_inputs``."""
