@@ -42,6 +42,7 @@ adam         adam         adam                                  kernels/test_ada
 network      torch        network                               kernels/test_network
                           network_adjoint
                           network_pairs
+                          network_parts
 roofline                  roofline                              benchmark/test_scaling
 sharing                   sharing                               runtime/test_launch
 ===========  ===========  ================  ==================  ========================================

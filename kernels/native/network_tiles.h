@@ -30,16 +30,30 @@ struct Tiles {
         __builtin_ia32_tileloadd64(3, sums + SIDE * PANEL + SIDE, 4 * PANEL);
     }
 
-    // Add the product of 32 rows of 16 pairs, row by row, and of 16 rows of 32 pairs, PANEL apart.
-    void add(const unsigned* left, const unsigned* right) const {
+    // Read 32 rows of 16 pairs, row by row.
+    void read_left(const unsigned* left) const {
         __builtin_ia32_tileloadd64(4, left, 4 * SIDE);
+        __builtin_ia32_tileloadd64(5, left + SIDE * SIDE, 4 * SIDE);
+    }
+
+    // Read 16 rows of 32 pairs, PANEL apart.
+    void read_right(const unsigned* right) const {
         __builtin_ia32_tileloadd64(6, right, 4 * PANEL);
         __builtin_ia32_tileloadd64(7, right + SIDE, 4 * PANEL);
-        __builtin_ia32_tileloadd64(5, left + SIDE * SIDE, 4 * SIDE);
+    }
+
+    // Add the product of the factors that were read.
+    void add() const {
         __builtin_ia32_tdpbf16ps(0, 4, 6);
         __builtin_ia32_tdpbf16ps(1, 4, 7);
         __builtin_ia32_tdpbf16ps(2, 5, 6);
         __builtin_ia32_tdpbf16ps(3, 5, 7);
+    }
+
+    void add(const unsigned* left, const unsigned* right) const {
+        read_left(left);
+        read_right(right);
+        add();
     }
 
     void end(float* sums) const {

@@ -13,6 +13,7 @@ from torch import Tensor
 from ..kernels.cpu import network as kernels
 from ..kernels.cpu import network_adjoint as kernels_adjoint
 from ..kernels.cpu import network_pairs as kernels_pairs
+from ..kernels.cpu import network_parts as kernels_parts
 from ..kernels.types import NETWORK_BLOCK, NETWORK_PANEL
 from ..runtime.launch import launch
 from ..runtime.matrix_tiles import may_use_tiles
@@ -24,6 +25,11 @@ ROWS_AT_ONCE = 8192
 ADJOINT_ROWS_AT_ONCE = 2048
 """Number of rows of the adjoint evaluated at once. A multiple of 32, it does not affect the result."""
 FLOAT_BYTES = 4
+BFLOAT16_PARTS = 3
+"""Number of bfloat16 numbers whose sum stands for a float32 number."""
+TILED_BLOCK, MANY_BLOCKS = 128, 4
+"""Number of rows that one thread takes through all layers by tiles, so that it reads the weights once for all of them,
+and the number of such blocks from which on they are this large."""
 PARTS = 2
 """Number of tasks that share a panel of a layer's weight gradients."""
 
@@ -43,9 +49,11 @@ class Layout(NamedTuple):
     """Where the layers' weights and gradients are in memory; it depends on their shapes alone."""
 
     table: np.ndarray
-    """[layers, 9] int64, as the kernels read it, without addresses."""
+    """[layers, 10] int64, as the kernels read it, without addresses."""
     packed: int
     """Number of packed values."""
+    parts: int
+    """Number of pairs of packed bfloat16 parts."""
     gradients: np.ndarray
     """[layers] byte at which each layer's gradients begin: those of the weights, then those of the biases."""
     sizes: list[int]
@@ -55,19 +63,20 @@ class Layout(NamedTuple):
 @functools.lru_cache(maxsize=32)
 def _layout(shapes: tuple[tuple[int, int], ...], inputs: int, inputs_adjoint: bool) -> Layout:
     """Lay out layers of ``shapes`` (out, in); the other arguments are those of :class:`Layers`."""
-    rows, sizes, at, before = [], [], 0, 0
+    rows, sizes, at, parts, before = [], [], 0, 0, 0
     for out, columns in shapes:
         own = columns - before
         panels = -(-out // NETWORK_PANEL)
         adjoint = at + panels * NETWORK_PANEL * columns
         to_inputs = adjoint + before * panels * NETWORK_PANEL
         wanted = inputs_adjoint and own > 0
-        rows.append([0, 0, own, before, out, at, adjoint if before else -1, to_inputs if wanted else -1, 0])
+        rows.append([0, 0, own, before, out, at, adjoint if before else -1, to_inputs if wanted else -1, 0, parts])
         at = to_inputs + (-(-own // NETWORK_PANEL) * NETWORK_PANEL * out if wanted else 0)
+        parts += BFLOAT16_PARTS * panels * sum(-(-n // NETWORK_PANEL) for n in (own, before)) * NETWORK_PANEL**2 // 2
         sizes += [out * columns, out]
         before = out
     begins = np.cumsum([0, *sizes])[:-1:2] * FLOAT_BYTES
-    return Layout(np.array(rows, np.int64), at, begins, sizes)
+    return Layout(np.array(rows, np.int64), at, parts, begins, sizes)
 
 
 class Layers:
@@ -104,7 +113,19 @@ class Layers:
         self.pairs = torch.empty(self.layout.packed // 2 if bfloat16 and not inputs_adjoint else 0, dtype=torch.int32)
         """Weights in pairs of bfloat16, for the adjoint; empty: it is computed in float32."""
         paired, tasks = len(self.pairs) > 0, len(weights) * widest
-        launch(kernels.pack_weights, tasks, widest, int(not paired), self.table, self.packed, grain=1)
+        self.parts = torch.empty(self.layout.parts if pair_products() > 1 else 0, dtype=torch.int32)
+        """Weights in three parts of bfloat16, for the values; empty: they are computed without tiles."""
+        if len(self.parts):
+            launch(
+                kernels_parts.pack_weight_parts,
+                len(weights) * self.panels,
+                self.panels,
+                self.table,
+                self.parts,
+                grain=1,
+            )
+        if not (len(self.parts) and paired):
+            launch(kernels.pack_weights, tasks, widest, int(not paired), self.table, self.packed, grain=1)
         if paired:
             launch(kernels_pairs.pack_weight_pairs, tasks, widest, self.table, self.pairs, grain=1)
 
@@ -114,11 +135,30 @@ class Layers:
         rows = -(-count // ROW_MULTIPLE) * ROW_MULTIPLE
         inputs = torch.empty(-(-self.inputs // NETWORK_PANEL), rows, NETWORK_PANEL)
         launch(kernels.pack_inputs, rows, where, when, inputs)
-        hidden = torch.empty(len(self.weights) if keep else 2, rows, self.panels * NETWORK_PANEL)
         out = torch.empty(count, self.outputs)
+        if len(self.parts):
+            hidden = torch.empty(len(self.weights) if keep else 0, rows, self.panels * NETWORK_PANEL)
+            self._values_in_parts(inputs, hidden, out)
+            return inputs, hidden, out
+        hidden = torch.empty(len(self.weights) if keep else 2, rows, self.panels * NETWORK_PANEL)
         blocks, size = -(-rows // NETWORK_BLOCK), NETWORK_BLOCK
         launch(kernels.network_values, blocks, size, int(keep), self.table, self.packed, inputs, hidden, out, grain=1)
         return inputs, hidden, out
+
+    def _values_in_parts(self, inputs: Tensor, hidden: Tensor, out: Tensor) -> None:
+        """Write the outputs, and the hidden values if ``hidden`` has room for them."""
+        rows, keep = inputs.shape[1], int(len(hidden) > 0)
+        size = TILED_BLOCK if rows >= MANY_BLOCKS * TILED_BLOCK else TILED_BLOCK // 2
+        room, pairs = -(-rows // NETWORK_BLOCK) * NETWORK_BLOCK, NETWORK_PANEL // 2
+        scratch = [
+            torch.empty(count, panels, room, pairs, dtype=torch.int32)
+            for count, panels in ((BFLOAT16_PARTS, len(inputs)), (2 * BFLOAT16_PARTS, self.panels))
+        ]
+        weights = self.table, self.parts
+        launch(
+            kernels_parts.network_values_parts, -(-rows // size), size, keep, *weights, inputs, *scratch, hidden, out,
+            grain=1,
+        )  # fmt: skip
 
     def gradients(
         self, inputs: Tensor, hidden: Tensor, v_out: Tensor, sizes: tuple[int, int, int] | None

@@ -37,10 +37,19 @@ def rows(shape: tuple, positions: int, times: int, seed: int) -> tuple[Tensor, T
     return torch.randn(positions, shape[0], generator=random), torch.randn(times, shape[1], generator=random)
 
 
+@pytest.fixture(params=[1, 2], ids=["pairs", "tiles"])
+def products(request, monkeypatch) -> int:
+    """Products of bfloat16 in pairs, and in tiles where the processor has them."""
+    if request.param == 2 and ops.pair_products() < 2:
+        pytest.skip("needs AMX")
+    monkeypatch.setattr(ops, "pair_products", lambda: request.param)
+    return request.param
+
+
 @pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize("positions, times", [(1, 1), (7, 1), (13, 3), (70, 1)])
 @pytest.mark.parametrize("shape", SHAPES)
-def test_values_and_gradients(shape, positions, times, seed):
+def test_values_and_gradients(shape, positions, times, seed, products):
     weights, biases = parameters(shape, seed)
     where, when = rows(shape, positions, times, seed)
     where.requires_grad_()
@@ -55,15 +64,6 @@ def test_values_and_gradients(shape, positions, times, seed):
     for got, want in zip(gradients, truth):
         # Relative to the whole tensor: a value within rounding of 0 may lie on either side of the ReLU.
         assert float((got.double() - want).norm() / want.norm().clamp_min(1e-6)) < 2e-3
-
-
-@pytest.fixture(params=[1, 2], ids=["pairs", "tiles"])
-def products(request, monkeypatch) -> int:
-    """Products of bfloat16 in pairs, and in tiles where the processor has them."""
-    if request.param == 2 and ops.pair_products() < 2:
-        pytest.skip("needs AMX")
-    monkeypatch.setattr(ops, "pair_products", lambda: request.param)
-    return request.param
 
 
 @pytest.mark.parametrize("positions, times", [(1, 1), (7, 1), (13, 3), (70, 1)])
@@ -111,6 +111,52 @@ def test_factors_are_rounded_where_that_saves_time(found, monkeypatch):
         model = DeformationNetwork({"translations": 3}, width=32, bfloat16_adjoint=wanted)
         model(torch.rand(5, 3), torch.rand(2))
     assert asked == [False, found > 0]
+
+
+@pytest.mark.parametrize("shape", SHAPES)
+def test_values_have_the_precision_of_float32(shape, products):
+    weights, biases = parameters(shape, 22)
+    where, when = rows(shape, 300, 2, 22)
+    with torch.no_grad():
+        found = network(where, when, weights, biases).double()
+        expected = twin(where.double(), when.double(), [w.double() for w in weights], [b.double() for b in biases])
+        rounded = network(where.bfloat16().float(), when, weights, biases).double()
+    assert float((found - expected).norm() / expected.norm()) < 1e-6
+    assert float((rounded - expected).norm() / expected.norm()) > 1e-4
+
+
+def test_a_row_has_the_same_bits_in_any_block(products):
+    weights, biases = parameters(SHAPES[0], 23)
+    where, when = rows(SHAPES[0], 700, 1, 23)
+    with torch.no_grad():
+        whole = network(where, when, weights, biases)
+        for begin, end in ((0, 1), (0, 130), (65, 100), (300, 700)):
+            assert torch.equal(network(where[begin:end], when, weights, biases), whole[begin:end])
+
+
+@pytest.mark.parametrize("bad", [float("nan"), float("inf")])
+def test_a_position_that_is_not_finite_spoils_its_own_row_alone(bad, products):
+    weights, biases = parameters(SHAPES[1], 24)
+    where, when = rows(SHAPES[1], 40, 1, 24)
+    clean = network(where, when, weights, biases)
+    where[5] = bad
+    found = network(where, when, weights, biases)
+    assert not bool(found[5].isfinite().all())
+    kept = torch.arange(40) != 5
+    assert torch.equal(found[kept], clean[kept])
+
+
+def test_weights_are_packed_only_as_the_kernels_need_them(products, monkeypatch):
+    launched: list[str] = []
+    launch = ops.launch
+    monkeypatch.setattr(ops, "launch", lambda kernel, *a, **k: launched.append(kernel.key) or launch(kernel, *a, **k))
+    weights, biases = parameters(SHAPES[0], 25)
+    network(*rows(SHAPES[0], 9, 1, 25), weights, biases, bfloat16=True).sum().backward()
+    assert launched.count("network_values_parts") == launched.count("pack_weight_parts") == int(products == 2)
+    assert launched.count("network_values") == launched.count("pack_weights") == int(products == 1)
+    network(*rows(SHAPES[0], 9, 1, 25), weights, biases).sum().backward()
+    assert launched.count("network_values_parts") == 2 * int(products == 2)
+    assert launched.count("pack_weights") == 1 + int(products == 1)
 
 
 class Kernel:
