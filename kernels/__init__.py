@@ -33,6 +33,7 @@ skinning     skinning     skinning          node_sums           kernels/test_ski
 correctives  correctives  correctives                           kernels/test_correctives
 shading      shading      shading                               kernels/test_shading
 posing       posing       posing                                kernels/test_posing
+silhouette   silhouette   silhouette                            kernels/test_silhouette
 harmonics    harmonics    harmonics         harmonics           kernels/test_harmonics
                                                                 kernels/cuda/test_harmonics
 ssim         ssim         ssim              ssim                kernels/test_ssim

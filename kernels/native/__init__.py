@@ -23,7 +23,7 @@ from typing import Any, Literal
 
 import warp as wp
 
-from .. import binning, correctives, harmonics, neighbors, posing, projection, shading, ssim, types
+from .. import binning, correctives, harmonics, neighbors, posing, projection, shading, silhouette, ssim, types
 
 FOLDER = Path(__file__).parent
 CONSTANTS: dict[str, int | float] = {
@@ -71,6 +71,8 @@ CONSTANTS: dict[str, int | float] = {
     "SHADING_GREY": shading.GREY,
     "SHADING_TINT_MAX": shading.TINT_MAX,
     "SHADING_TINT_MIN": shading.TINT_MIN,
+    # Silhouettes.
+    "SILHOUETTE_NEAREST_DEPTH": silhouette.NEAREST_DEPTH,
 }
 """Values of the shared macros by name; a header gets those that occur in its text."""
 

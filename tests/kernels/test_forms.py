@@ -16,7 +16,7 @@ COLUMNS = ("portable", "cpu", "cuda", "compared in")
 FOLDERS = {"portable": "", "cpu": "cpu/", "cuda": "cuda/"}
 RENAMED = (
     *("adam", "compositing", "correctives", "harmonics", "neighbors"),
-    *("posing", "projection", "shading", "skinning", "ssim"),
+    *("posing", "projection", "shading", "silhouette", "skinning", "ssim"),
 )
 """Stages whose forms have the same names for the same kernels."""
 
