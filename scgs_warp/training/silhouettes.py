@@ -18,8 +18,9 @@ from torch import Tensor
 
 from ..data.dataset import Dataset
 from ..geometry.normalisation import Normalisation
+from ..kernels.silhouette import NEAREST_DEPTH
+from ..ops.silhouette import silhouette
 from ..runtime.device_copies import sent
-from ..runtime.environment import one_piece
 from ..types import Camera
 
 COVERED = 0.3
@@ -33,8 +34,6 @@ KEPT_MIB, KEPT_ON_GPU_MIB = 64, 1024
 others are found again at each use, which takes a few milliseconds. On a GPU that would hold up the steps."""
 PIXELS = 512
 """Number of silhouette pixels that are compared in each step."""
-NEAREST_DEPTH = 1e-2
-"""Depth, normalised, below which a centre is treated as if it had this depth."""
 MEASURED_VIEWS = 50
 """Largest number of images in which the subject's thickness is measured."""
 THIN = 0.02
@@ -111,53 +110,7 @@ def silhouette_term(means: Tensor, camera: Camera, sample: SilhouetteSample) -> 
     Returns:
         Scalar, in units of the image's width. Gradients flow to ``means``.
     """
-    return _Term.apply(means, camera, sample)  # type: ignore[return-value]
-
-
-class _Term(torch.autograd.Function):
-    """The term with its gradient, both computed in one thread: in several, torch rounds differently."""
-
-    @staticmethod
-    def forward(ctx: Any, means: Tensor, camera: Camera, sample: SilhouetteSample) -> Tensor:
-        with one_piece(), torch.enable_grad():
-            leaf = means.detach().requires_grad_()
-            term = _term(leaf, camera, sample)
-            (gradient,) = torch.autograd.grad(term, leaf)
-        ctx.save_for_backward(gradient)
-        return term.detach()
-
-    @staticmethod
-    @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, v_term: Tensor):  # type: ignore[override]
-        (gradient,) = ctx.saved_tensors
-        return v_term * gradient, None, None
-
-
-def _term(means: Tensor, camera: Camera, sample: SilhouetteSample) -> Tensor:
-    points = _project(means, camera)
-    # Distance of the centres to the silhouette.
-    grid = 2.0 * points / sample.size - 1.0
-    table = sample.distances[None, None]
-    strayed = F.grid_sample(table, grid[None, None], align_corners=False, padding_mode="border")
-    # Distance of the silhouette's pixels to the centres.
-    pixels = sample.pixels
-    with torch.no_grad():
-        nearest = torch.cdist(pixels, points, compute_mode="donot_use_mm_for_euclid_dist").argmin(dim=1)
-    uncovered = (pixels - points[nearest]).norm(dim=1)
-    return strayed.mean() + uncovered.mean()
-
-
-def _project(means: Tensor, camera: Camera) -> Tensor:
-    """Project centres [N, 3] to [N, 2], in units of the image's width."""
-    local = _product(means, camera.viewmat[:3, :3]) + camera.viewmat[:3, 3]
-    homogeneous = _product(local, camera.K)
-    return homogeneous[:, :2] / local[:, 2:].clamp_min(NEAREST_DEPTH) / camera.width
-
-
-def _product(rows: Tensor, matrix: Tensor) -> Tensor:
-    """Multiply each of ``rows`` [N, 3] by a matrix [3, 3]. Torch's own product rounds differently for each number of
-    threads."""
-    return (rows[:, None, :] * matrix).sum(dim=2)
+    return silhouette(means, camera, sample.distances, sample.size, sample.pixels)
 
 
 class Silhouettes:
