@@ -128,7 +128,7 @@ def composite_adjoint(
     transmittance_in: wp.array2d[float],  # [H, W]
     last_in: wp.array2d[int],  # [H, W]
     v_image_in: wp.array3d[float],  # [C, H, W]
-    v_alpha_in: wp.array2d[float],  # [H, W]
+    v_alpha_in: wp.array2d[float],  # [H, W], or null: zeros
     width: int,
     height: int,
     columns: int,

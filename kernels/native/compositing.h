@@ -184,7 +184,7 @@ static inline void composite_tile_adjoint(
         for (int b = 0; b < 16; ++b) {
             T[b] = get(transmittance.data, b);
             ends[b] = (vi)get((const float*)last.data, b);
-            vf total = ZERO - get(v_alpha.data, b);
+            vf total = v_alpha.data ? ZERO - get(v_alpha.data, b) : ZERO;
             for (int c = 0; c < channels; ++c) total += get(v_image.data + c * plane, b) * background.data[c];
             behind[b] = total;
             for (int c = 0; c < C; ++c) v[b][c] = c < channels ? get(v_image.data + c * plane, b) : ZERO;
@@ -196,7 +196,7 @@ static inline void composite_tile_adjoint(
             if (next >= plane) break;
             __builtin_prefetch(transmittance.data + next);
             __builtin_prefetch(last.data + next);
-            __builtin_prefetch(v_alpha.data + next);
+            if (v_alpha.data) __builtin_prefetch(v_alpha.data + next);
             for (int c = 0; c < C; ++c) __builtin_prefetch(v_image.data + c * plane + next);
         }
         for (int p = last_pair; p < end; ++p)

@@ -146,13 +146,13 @@ def check_slots(tiles: Tiles, v_slots: Tensor) -> None:
     expect(~left, "every gradient slot was written before it is read")
 
 
-def check_gradients(gradients: tuple[Tensor | None, ...], v_image: Tensor, v_alpha: Tensor) -> None:
+def check_gradients(gradients: tuple[Tensor | None, ...], v_image: Tensor, v_alpha: Tensor | None) -> None:
     """Check that finite incoming gradients give finite gradients.
 
     Raises:
         BrokenInvariant: they do not.
     """
-    if _safe(v_image, v_alpha):
+    if _safe(v_image, *([] if v_alpha is None else [v_alpha])):
         for gradient in gradients:
             expect(gradient is None or gradient.isfinite(), "gradients of finite gradients are finite")
 

@@ -123,14 +123,19 @@ class _Composite(torch.autograd.Function):
         image, alpha, *kept = _forward(job, tensors, keep=True)
         ctx.save_for_backward(*tensors, *kept)
         ctx.job = job
+        ctx.set_materialize_grads(False)
         return image, alpha
 
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, v_image: Tensor, v_alpha: Tensor) -> tuple[Tensor | None, ...]:
+    def backward(ctx: Any, v_image: Tensor | None, v_alpha: Tensor | None) -> tuple[Tensor | None, ...]:
         *tensors, source, transmittance, last = ctx.saved_tensors
-        v_image, v_alpha = v_image.contiguous(), v_alpha.contiguous()
         job: _Job = ctx.job
+        if v_image is None:
+            v_image = transmittance.new_zeros(tensors[3].shape[1], *transmittance.shape)
+        if v_alpha is None and job.form != "cpu":
+            v_alpha = torch.zeros_like(transmittance)
+        v_image, v_alpha = v_image.contiguous(), None if v_alpha is None else v_alpha.contiguous()
         absolute = job.absgrad is not None or (job.stats is not None and job.stats.absolute)
         v_means2d, v_conics, v_opacities, v_channels = (torch.empty_like(t) for t in tensors[:4])
         absgrad = job.absgrad
@@ -288,11 +293,11 @@ def _adjoint(
     window: Window,
     tensors: list[Tensor],
     source: Tensor,
-    pixels: tuple[Tensor, ...],
+    pixels: tuple[Tensor | None, ...],
     absolute: bool,
 ) -> Tensor:
     """Return the gradient slots of all listed pairs, [P, S]. ``pixels``: final transmittance, last contributor, and the
-    gradients of image and alpha."""
+    gradients of image and alpha; the last may be None on a CPU, which means zeros."""
     means2d, conics, _, channels, background = tensors
     v_slots = checks.unwritten_slots(len(tiles.splats), _slot_width(channels.shape[1]), channels.device)
     lists = (background, tiles.ranges, tiles.splats, tiles.slots, *pixels)

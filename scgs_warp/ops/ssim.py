@@ -3,6 +3,7 @@ adjoint."""
 
 from __future__ import annotations
 
+import math
 from typing import Any, Literal
 
 import torch
@@ -146,33 +147,31 @@ class _Photometric(torch.autograd.Function):
             sums = image.new_zeros(3, 1, 1)
         else:
             sums = (_forward_bands if simd else _forward_pixels)(image, truth, mask, partials)
-        totals = sums.flatten(1).double().sum(1)  # a few thousand values: one thread, one order
-        # Valid pixels times channels: a number, or a tensor, because reading its value would wait for the device.
-        count: float | Tensor = float(max(image.numel(), 1))
-        if mask is not None:
-            count = mask.sum().double() * image.shape[0]
-            totals = torch.stack([totals[0], torch.where(count > 0, totals[1], 1.0), totals[2]])
-            count = count.clamp(min=1.0)
-        elif image.numel() == 0:
-            totals[1] = 1.0
-        l1, similarity, error = totals / count
+        # A few thousand values in one order. The rest are single numbers, which torch handles more slowly than Python.
+        totals = sums.flatten(1).double().sum(1).tolist()
+        count = float(image.numel() if mask is None else int(mask.sum()) * image.shape[0])
+        l1, similarity, error = (total / max(count, 1.0) for total in totals)
+        if count == 0.0:
+            similarity = 1.0
         loss = (1.0 - weights[0]) * l1 + weights[0] * (1.0 - similarity)
         if weights[1]:
-            loss = loss + weights[1] * error.clamp(min=LEAST_ERROR).log()
-        ctx.save_for_backward(image, truth, mask, partials, error)
-        ctx.weights, ctx.simd, ctx.count = weights, simd, count
-        return loss.float(), l1.float(), similarity.float()
+            loss += weights[1] * math.log(LEAST_ERROR if error < LEAST_ERROR else error)  # NaN is kept
+        ctx.save_for_backward(image, truth, mask, partials)
+        ctx.weights, ctx.simd, ctx.count, ctx.error = weights, simd, max(count, 1.0), error
+        ctx.set_materialize_grads(False)
+        return image.new_tensor(loss), image.new_tensor(l1), image.new_tensor(similarity)
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, v_loss: Tensor, v_l1: Tensor, v_ssim: Tensor) -> tuple[Tensor | None, ...]:
-        image, truth, mask, partials, error = ctx.saved_tensors
+    def backward(ctx: Any, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:
+        image, truth, mask, partials = ctx.saved_tensors
+        v_loss, v_l1, v_ssim = (0.0 if v is None else float(v) for v in gradients)
         ssim_weight, log_weight = ctx.weights
         v_image = torch.empty_like(image)
         if image.numel():
-            v_error = torch.where(error > LEAST_ERROR, log_weight / error, 0.0) * v_loss
-            v_means = torch.stack([v_l1 + (1.0 - ssim_weight) * v_loss, v_ssim - ssim_weight * v_loss, v_error])
-            v_sums = (v_means / ctx.count).float()
+            v_error = log_weight / ctx.error * v_loss if ctx.error > LEAST_ERROR else 0.0
+            v_means = v_l1 + (1.0 - ssim_weight) * v_loss, v_ssim - ssim_weight * v_loss, v_error
+            v_sums = image.new_tensor([v / ctx.count for v in v_means])
             if ctx.simd:
                 bands = image.shape[0] * -(-image.shape[1] // SSIM_BAND)
                 launch.launch(
