@@ -128,14 +128,15 @@ class _Composite(torch.autograd.Function):
 
     @staticmethod
     @torch.autograd.function.once_differentiable
-    def backward(ctx: Any, v_image: Tensor | None, v_alpha: Tensor | None) -> tuple[Tensor | None, ...]:
+    def backward(ctx: Any, v_image: Any, v_alpha: Tensor | None) -> tuple[Tensor | None, ...]:
         *tensors, source, transmittance, last = ctx.saved_tensors
         job: _Job = ctx.job
-        if v_image is None:
-            v_image = transmittance.new_zeros(tensors[3].shape[1], *transmittance.shape)
-        if v_alpha is None and job.form != "cpu":
+        no_image = (tensors[3].shape[1], *transmittance.shape)
+        v_image = transmittance.new_zeros(no_image) if v_image is None else v_image.contiguous()
+        if v_alpha is not None:
+            v_alpha = v_alpha.contiguous()
+        elif job.form != "cpu":
             v_alpha = torch.zeros_like(transmittance)
-        v_image, v_alpha = v_image.contiguous(), None if v_alpha is None else v_alpha.contiguous()
         absolute = job.absgrad is not None or (job.stats is not None and job.stats.absolute)
         v_means2d, v_conics, v_opacities, v_channels = (torch.empty_like(t) for t in tensors[:4])
         absgrad = job.absgrad
@@ -293,7 +294,7 @@ def _adjoint(
     window: Window,
     tensors: list[Tensor],
     source: Tensor,
-    pixels: tuple[Tensor | None, ...],
+    pixels: tuple[Any, ...],
     absolute: bool,
 ) -> Tensor:
     """Return the gradient slots of all listed pairs, [P, S]. ``pixels``: final transmittance, last contributor, and the
