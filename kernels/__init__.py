@@ -7,7 +7,8 @@ A file is named after its stage of the pipeline. ``kernels/X.py`` is the portabl
 device and is the readable reference. ``cpu/X.py`` is the SIMD form for CPUs, and ``cuda/X.py`` is the form for CUDA,
 which works by warps or blocks of threads; the C++ code of both is in ``native/``. A kernel that several forms share has
 the same name in each, and the adjoint of kernel ``x`` is ``x_adjoint``. Other kernels exist in one form only: for
-example, the CPU's ``skin_rbf`` does in one pass what ``rbf_weights`` and ``skin`` do in two.
+example, the CPU's ``skin_rbf`` does in one pass what ``rbf_weights`` and ``skin`` do in two, and its ``finish`` what
+correctives, tints, shading and activations do in up to five.
 
 A CPU runs the cpu form where there is one, and CUDA runs the cuda form where there is one; otherwise the portable form
 runs. The portable form of the network and of activations is torch. The torch op of a stage is in ``scgs_warp/ops/``,
@@ -33,6 +34,7 @@ skinning     skinning     skinning          node_sums           kernels/test_ski
 correctives  correctives  correctives                           kernels/test_correctives
 shading      shading      shading                               kernels/test_shading
 posing       posing       posing                                kernels/test_posing
+                          finishing                             kernels/test_finishing
 silhouette   silhouette   silhouette                            kernels/test_silhouette
 harmonics    harmonics    harmonics         harmonics           kernels/test_harmonics
                                                                 kernels/cuda/test_harmonics

@@ -2,7 +2,7 @@
 of a Gaussian in one launch, without one.
 
 A frame on a GPU is many small kernels, so its time is that of their number. Training runs the kernels of the parts,
-which have adjoints.
+which have adjoints; on a CPU, two of them: skinning, and what follows it (``cpu/finishing.py``).
 """
 
 import warp as wp

@@ -62,7 +62,7 @@ CONSTANTS: dict[str, int | float] = {
     "GRADIENT_MAX": types.GRADIENT_MAX,
     "POSITION_MAX": types.POSITION_MAX,
     "RADIUS_MAX": projection.RADIUS_MAX,
-    # Correctives, shading and posing.
+    # Correctives, shading, finishing and posing.
     "CORRECTIVE_SCALE": correctives.SCALE,
     "EXTRAS_LOG_SCALES": posing.LOG_SCALES,
     "EXTRAS_TINTS": posing.TINTS,

@@ -35,6 +35,14 @@ ALWAYS_INLINE void read_matrix(const wp::array_t<float>& correctives, int begin,
     for (int k = 5; k < 16; ++k) C[11 + k] = right[k];
 }
 
+// Write the matrices C. Changes them.
+ALWAYS_INLINE void write_matrix(wp::array_t<float>& correctives, int begin, int rows, vf* C) {
+    vf right[16];
+    for (int k = 0; k < 16; ++k) right[k] = C[11 + k];
+    write_columns(correctives.data, begin, rows, 27, 0, 16, C);
+    write_columns(correctives.data, begin, rows, 27, 11, 16, right);
+}
+
 // Displace the means of a block.
 ALWAYS_INLINE void displace(const vf* C, const Turns& turns, vf* mean) {
     FUSE_WITHIN_EXPRESSIONS
@@ -51,6 +59,22 @@ ALWAYS_INLINE void displace(const vf* C, const Turns& turns, vf* mean) {
     }
     const vi valid = finite(change);
     for (int a = 0; a < 3; ++a) mean[a] = valid ? moved[a] : mean[a];
+}
+
+// Compute the gradients of the matrices C of a block; 0 for a displacement that is left out.
+ALWAYS_INLINE void displace_adjoint(const vf* C, const Turns& turns, const vf* v_mean, vf* v_C) {
+    FUSE_WITHIN_EXPRESSIONS
+    vf v_shift[3], total = {};
+    for (int a = 0; a < 3; ++a) {
+        const vf* R = turns.rotation + a;
+        v_shift[a] = CORRECTIVE_SCALE * (R[0] * v_mean[0] + R[3] * v_mean[1] + R[6] * v_mean[2]);
+        for (int k = 0; k < 9; ++k) {
+            v_C[9 * a + k] = v_shift[a] * turns.turn[k];
+            total = total + (C[9 * a + k] * turns.turn[k] + v_C[9 * a + k]);
+        }
+    }
+    const vi valid = finite(total);
+    for (int k = 0; k < 27; ++k) v_C[k] = valid ? v_C[k] : vf{};
 }
 
 static inline void correct_block(
@@ -72,24 +96,12 @@ static inline void correct_block_adjoint(
     const wp::array_t<wp::vec4>& quats_t, const wp::array_t<wp::vec4>& quats_own, int has_own,
     const wp::array_t<wp::vec3>& v_means_t, wp::array_t<float>& v_correctives
 ) {
-    FUSE_WITHIN_EXPRESSIONS
     const int total_rows = correctives.shape[0];
     const int rows = total_rows - begin < 16 ? total_rows - begin : 16;
     const Turns turns = read_turns(begin, rows, quats, quats_t, quats_own, has_own);
-    vf C[27], v_mean[3], v_shift[3], v_C[27], right[16], total = {};
+    vf C[27], v_mean[3], v_C[27];
     read_matrix(correctives, begin, rows, C);
     read_vectors(v_means_t.data, begin, rows, 3, v_mean);
-    for (int a = 0; a < 3; ++a) {
-        const vf* R = turns.rotation + a;
-        v_shift[a] = CORRECTIVE_SCALE * (R[0] * v_mean[0] + R[3] * v_mean[1] + R[6] * v_mean[2]);
-        for (int k = 0; k < 9; ++k) {
-            v_C[9 * a + k] = v_shift[a] * turns.turn[k];
-            total = total + (C[9 * a + k] * turns.turn[k] + v_C[9 * a + k]);
-        }
-    }
-    const vi valid = finite(total);
-    for (int k = 0; k < 27; ++k) v_C[k] = valid ? v_C[k] : vf{};
-    for (int k = 0; k < 16; ++k) right[k] = v_C[11 + k];
-    write_columns(v_correctives.data, begin, rows, 27, 0, 16, v_C);
-    write_columns(v_correctives.data, begin, rows, 27, 11, 16, right);
+    displace_adjoint(C, turns, v_mean, v_C);
+    write_matrix(v_correctives, begin, rows, v_C);
 }

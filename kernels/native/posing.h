@@ -1,8 +1,6 @@
 // Posing of 16 Gaussians, one per lane: skinning, correctives, tints, shading and activations in one pass.
 #pragma once
-#include "activations.h"
-#include "correctives.h"
-#include "shading.h"
+#include "finishing.h"
 #include "skinning.h"
 
 static inline void pose_block(
@@ -27,28 +25,14 @@ static inline void pose_block(
         const float* weight = (const float*)read_rows(weights.data + (long long)begin * K, rows, 4 * K, spare_weights);
         if (!aligned) weight_columns(weight, K, columns);
         Moved to = moved_by(x, rest, motion, reach, pick, K, weight, columns, aligned, extras != 0);
-        // 2. Displace, tint and shade by the rotation since rest.
-        vf color[3], own[4];
-        read_vectors(sh_dc.data, begin, rows, 3, color);
+        // 2. Displace, tint, shade and activate.
+        vf own[4], scale[3], color[3];
         if (has_own) read_vectors(quats_own.data, begin, rows, 4, own);
-        const Turns turns = Turns(rest, to.quat, has_own ? own : nullptr);
-        if (correctives.shape[1]) {
-            vf C[27];
-            read_matrix(correctives, begin, rows, C);
-            displace(C, turns, to.mean);
-        }
-        if (extras == EXTRAS_TINTS)
-            for (int c = 0; c < 3; ++c) brighten(tint_factor(to.extra[c]), color[c]);
-        if (shading.shape[1]) {
-            const vf factor = Gain(begin, rows, shading, turns.turn).limited();
-            for (int c = 0; c < 3; ++c) brighten(factor, color[c]);
-        }
-        // 3. Activate.
-        vf scale[3];
-        read_vectors(log_scales.data, begin, rows, 3, scale);
-        for (int c = 0; c < 3; ++c)
-            scale[c] = whole_exponential(extras == EXTRAS_LOG_SCALES ? scale[c] + to.extra[c] : scale[c]);
-        const vf opacity = sigmoid_of(load(opacity_logits.data + begin, rows));
+        const Turned quat{rest, to.quat, has_own ? own : nullptr};
+        const vf opacity = finish(
+            begin, rows, log_scales, opacity_logits, sh_dc, correctives, shading, quat, to.extra, extras, to.mean,
+            scale, color
+        );
         write_vectors(means_t.data, begin, rows, 3, to.mean);
         write_vectors(quats_t.data, begin, rows, 4, to.quat);
         write_vectors(scales_t.data, begin, rows, 3, scale);

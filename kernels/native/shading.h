@@ -24,6 +24,24 @@ struct Gain {
         const vf within = low > SHADING_GAIN_MAX ? vf{} + SHADING_GAIN_MAX : low;
         return finite(free) ? within : vf{} + 1.0f;
     }
+
+    // Turn the gradients `v` of shaded colours into those of `color`, and write those of G and b, 16 columns.
+    __attribute__((always_inline)) void adjoint(const vf* color, vf* v, vf* v_G) const {
+        FUSE_WITHIN_EXPRESSIONS
+        const vf factor = limited();
+        vf v_factor = {};
+        for (int c = 0; c < 3; ++c) {
+            v_factor = v_factor + v[c] * (color[c] + SHADING_GREY);
+            v[c] = factor * v[c];
+        }
+        v_factor = (finite(free) & (free == factor)) ? v_factor : vf{};
+        const vf v_x = v_factor * (1.0f + 2.0f * SHADING_BEND * bend * x);
+        const vf v_bend = v_factor * SHADING_BEND * x * x;
+        const vi valid = finite(v_x * (turn[0] + turn[4] + turn[8]) + v_bend);
+        for (int k = 0; k < 9; ++k) v_G[k] = valid ? v_x * turn[k] : vf{};
+        v_G[9] = valid ? v_bend : vf{};
+        for (int k = 10; k < 16; ++k) v_G[k] = vf{};
+    }
 };
 
 // Read the gain of a block.
@@ -63,24 +81,13 @@ static inline void shade_block_adjoint(
     const wp::array_t<wp::vec4>& quats, const wp::array_t<wp::vec4>& quats_t, const wp::array_t<wp::vec3>& v_shaded,
     wp::array_t<wp::vec3>& v_sh_dc, wp::array_t<float>& v_shading
 ) {
-    FUSE_WITHIN_EXPRESSIONS
     const int rows = sh_dc.shape[0] - begin < 16 ? sh_dc.shape[0] - begin : 16;
     const Gain gain = read_gain(begin, rows, shading, quats, quats_t);
-    const vf factor = gain.limited();
-    vf color[3], v[3], v_color[3], v_factor = {}, v_G[16] = {};
+    vf color[3], v[3], v_G[16];
     read_vectors(sh_dc.data, begin, rows, 3, color);
     read_vectors(v_shaded.data, begin, rows, 3, v);
-    for (int c = 0; c < 3; ++c) {
-        v_color[c] = factor * v[c];
-        v_factor = v_factor + v[c] * (color[c] + SHADING_GREY);
-    }
-    write_vectors(v_sh_dc.data, begin, rows, 3, v_color);
-    v_factor = (finite(gain.free) & (gain.free == factor)) ? v_factor : vf{};
-    const vf v_x = v_factor * (1.0f + 2.0f * SHADING_BEND * gain.bend * gain.x);
-    const vf v_bend = v_factor * SHADING_BEND * gain.x * gain.x;
-    const vi valid = finite(v_x * (gain.turn[0] + gain.turn[4] + gain.turn[8]) + v_bend);
-    for (int k = 0; k < 9; ++k) v_G[k] = valid ? v_x * gain.turn[k] : vf{};
-    v_G[9] = valid ? v_bend : vf{};
+    gain.adjoint(color, v, v_G);
+    write_vectors(v_sh_dc.data, begin, rows, 3, v);
     write_columns(v_shading.data, begin, rows, 10, 0, 10, v_G);
 }
 
@@ -89,6 +96,14 @@ ALWAYS_INLINE vf tint_factor(vf tint) {
     const vf low = tint < SHADING_TINT_MIN ? vf{} + SHADING_TINT_MIN : tint;
     const vf within = low > SHADING_TINT_MAX ? vf{} + SHADING_TINT_MAX : low;
     return finite(tint) ? exponential(within) : vf{} + 1.0f;
+}
+
+// Turn the gradient `v` of a tinted colour into that of `color`, and return that of the tint, whose factor is given.
+ALWAYS_INLINE vf tint_adjoint(vf tint, vf factor, vf color, vf& v) {
+    FUSE_WITHIN_EXPRESSIONS
+    v = factor * v;
+    const vf v_tint = v * (color + SHADING_GREY);
+    return ((tint > SHADING_TINT_MIN) & (tint < SHADING_TINT_MAX) & finite(v_tint)) ? v_tint : vf{};
 }
 
 static inline void tint_block(
@@ -107,17 +122,12 @@ static inline void tint_block_adjoint(
     int begin, const wp::array_t<wp::vec3>& sh_dc, const wp::array_t<wp::vec3>& tints,
     const wp::array_t<wp::vec3>& v_tinted, wp::array_t<wp::vec3>& v_sh_dc, wp::array_t<wp::vec3>& v_tints
 ) {
-    FUSE_WITHIN_EXPRESSIONS
     const int rows = sh_dc.shape[0] - begin < 16 ? sh_dc.shape[0] - begin : 16;
-    vf color[3], tint[3], v_color[3], v_tint[3];
+    vf color[3], tint[3], v[3], v_tint[3];
     read_vectors(sh_dc.data, begin, rows, 3, color);
     read_vectors(tints.data, begin, rows, 3, tint);
-    read_vectors(v_tinted.data, begin, rows, 3, v_color);
-    for (int c = 0; c < 3; ++c) {
-        v_color[c] = tint_factor(tint[c]) * v_color[c];
-        const vf v = v_color[c] * (color[c] + SHADING_GREY);
-        v_tint[c] = ((tint[c] > SHADING_TINT_MIN) & (tint[c] < SHADING_TINT_MAX) & finite(v)) ? v : vf{};
-    }
-    write_vectors(v_sh_dc.data, begin, rows, 3, v_color);
+    read_vectors(v_tinted.data, begin, rows, 3, v);
+    for (int c = 0; c < 3; ++c) v_tint[c] = tint_adjoint(tint[c], tint_factor(tint[c]), color[c], v[c]);
+    write_vectors(v_sh_dc.data, begin, rows, 3, v);
     write_vectors(v_tints.data, begin, rows, 3, v_tint);
 }

@@ -10,11 +10,11 @@ from torch import Tensor, nn
 
 from ..config.presets import LossConfig, MotionConfig, TrainConfig
 from ..gaussians import GaussianParameters
-from ..ops.activations import exponential, sigmoid
+from ..ops.activations import sigmoid
 from ..ops.correctives import correct
+from ..ops.finishing import finish
 from ..ops.neighbors import NeighborSearch, rbf_weights
 from ..ops.posing import pose_gaussians, unit_pose
-from ..ops.shading import shade, tint
 from ..ops.skinning import skin, skin_rbf
 from ..runtime.device_copies import sent
 from ..seeding import generator
@@ -80,23 +80,22 @@ def _posed(
             motion, under an edit.
     """
     means, quats, extras = moved
-    if gaussians.correctives.shape[1]:
-        means = correct(means, gaussians.correctives, gaussians.quats, quats, own)
+    rest = gaussians.rest()
     if masked:
+        if gaussians.correctives.shape[1]:
+            means = correct(means, gaussians.correctives, gaussians.quats, quats, own)
+            rest = *rest[:5], gaussians.correctives.detach()[:, :0], rest[6]
         share = sigmoid(gaussians.hyper[:, -1:])
-        rest = F.normalize(gaussians.quats, dim=1)
-        rest = torch.where((rest * quats).sum(1, keepdim=True) < 0, -rest, rest)
+        still = F.normalize(gaussians.quats, dim=1)
+        still = torch.where((still * quats).sum(1, keepdim=True) < 0, -still, still)
         means = gaussians.means + share * (means - gaussians.means)
-        quats = rest + share * (quats - rest)
+        quats = still + share * (quats - still)
         if own is not None:
-            own = rest + share * (torch.where((rest * own).sum(1, keepdim=True) < 0, -own, own) - rest)
+            own = still + share * (torch.where((still * own).sum(1, keepdim=True) < 0, -own, own) - still)
         extras = None if extras is None else share * extras
     log_scales, tints = (extras, None) if pose.tints is None else (None, extras)
-    scales = gaussians.scales() if log_scales is None else exponential(gaussians.log_scales + log_scales)
-    sh_dc = gaussians.sh_dc if tints is None else tint(gaussians.sh_dc, tints)
-    if gaussians.shading.shape[1]:
-        sh_dc = shade(sh_dc, gaussians.shading, gaussians.quats, quats if own is None else own)
-    return Gaussians(means, quats, scales, gaussians.opacities(), sh_dc, gaussians.sh_rest, gaussians.sharpness)
+    means, scales, opacities, sh_dc = finish(means, quats, rest, log_scales, tints, own)
+    return Gaussians(means, quats, scales, opacities, sh_dc, gaussians.sh_rest, gaussians.sharpness)
 
 
 class ControlPoints(Motion):

@@ -13,8 +13,7 @@ from ..kernels.neighbors import MAX_NEIGHBORS
 from ..kernels.types import LANES
 from ..runtime.launch import launch
 from ..types import Pose
-from .correctives import COLUMNS as CORRECTIVE_COLUMNS
-from .shading import COLUMNS as SHADING_COLUMNS
+from .finishing import check_rest
 from .skinning import check_inputs, pack_palette, pose_tensors
 
 Form = Literal["auto", "plain", "cpu"]
@@ -91,7 +90,7 @@ def pose_gaussians(
         ValueError: a shape is wrong, or there are more neighbours than the form takes.
     """
     check_inputs(rest[0], rest[1], nodes, pose, indices, weights)
-    _check_rest(rest, own)
+    check_rest(rest, own)
     if form == "cpu" and indices.shape[1] > MAX_NEIGHBORS:
         raise ValueError(f"form cpu takes up to {MAX_NEIGHBORS} neighbours, got {indices.shape[1]}")
     translations, rotations, shapes, extras = (None if x is None else x.contiguous() for x in pose_tensors(pose))
@@ -110,12 +109,3 @@ def pose_gaussians(
         pose_of_nodes = translations, rotations, rotations if shapes is None else shapes, extras, kind
         launch(kernels.pose_gaussians, count, *rest, nodes, *pose_of_nodes, *binding, *posed)
     return posed
-
-
-def _check_rest(rest: tuple[Tensor, ...], own: Tensor | None) -> None:
-    count, names = len(rest[0]), ("log_scales", "opacity_logits", "sh_dc", "correctives", "shading", "own")
-    correctives, shading = ([(count, width), (count, 0)] for width in (CORRECTIVE_COLUMNS, SHADING_COLUMNS))
-    shapes = [(count, 3)], [(count,)], [(count, 3)], correctives, shading, [(count, 4)]
-    for name, value, allowed in zip(names, (*rest[2:], own), shapes, strict=True):
-        if value is not None and tuple(value.shape) not in allowed:
-            raise ValueError(f"{name} must be {' or '.join(str([*x]) for x in allowed)}, got {tuple(value.shape)}")

@@ -23,6 +23,7 @@ from scgs_warp.geometry.normalisation import Normalisation
 from scgs_warp.motion import Motion, build_motion
 from scgs_warp.ops.adam import Update, adam_step, first_not_finite
 from scgs_warp.ops.correctives import correct
+from scgs_warp.ops.finishing import finish
 from scgs_warp.ops.harmonics_rotation import SIZES, rotate_harmonics
 from scgs_warp.ops.reduction import sum_rows
 from scgs_warp.ops.shading import shade, tint
@@ -178,6 +179,29 @@ def case_correctives(d: Draw, device: str) -> None:
     laws.finite("gradients", *torch.autograd.grad(moved, leaves[:2], d.normal(count, 3).to(device)))
 
 
+def case_finishing(d: Draw, device: str) -> None:
+    """Valid rows are as if alone, those of gradients too."""
+    count, corrected, shaded, tinted = d.count(), d.chance(), d.chance(), d.chance()
+    widths = 3, 4, 3, 4, 3, 1, 3, 27 * corrected, 10 * shaded, 3
+    inputs = [d.normal(count, width) for width in widths]
+    inputs[5] = inputs[5][:, 0]
+    v_outputs = on(device, d.normal(count, 3), d.normal(count, 3), d.normal(count, 3)[:, 0], d.normal(count, 3))
+
+    def run() -> list[Tensor]:
+        leaves = [leaf(x) for x in on(device, *inputs)]
+        extras = (None, leaves[9]) if tinted else (leaves[9], None)
+        outputs = finish(leaves[0], leaves[1], tuple(leaves[2:9]), *extras)
+        gradients = torch.autograd.grad(outputs, [leaves[0], *leaves[4:]], v_outputs, allow_unused=True)
+        return [*outputs, *(x for x in gradients if x is not None)]
+
+    clean, hit = run(), d.rows(count)
+    for tensor in inputs:
+        if tensor.numel() and d.chance():
+            d.poison(tensor, hit)
+    for ours, other in zip(run(), clean, strict=True):
+        laws.equal("outputs and gradients of the valid", ours[~hit.to(device)], other[~hit.to(device)])
+
+
 def case_turned_harmonics(d: Draw, device: str) -> None:
     count, rest = d.count(), int(d.pick(SIZES))
     sh, quats, hit = d.normal(count, rest, 3), d.normal(count, 4), d.rows(count)
@@ -266,6 +290,7 @@ CASES = {
     "shading": (case_shading, 1),
     "tints": (case_tint, 1),
     "correctives": (case_correctives, 1),
+    "finishing": (case_finishing, 1),
     "turned harmonics": (case_turned_harmonics, 1),
     "densify": (case_densify, 1),
     "scene": (case_scene, 2),

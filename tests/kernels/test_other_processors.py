@@ -16,8 +16,8 @@ from scgs_warp.kernels import cpu
 
 TESTS = Path(__file__).resolve().parents[1]
 STAGES = (
-    "adam", "binning", "compositing", "compositing_extremes", "correctives", "harmonics", "neighbors", "network",
-    "posing", "projection", "shading", "silhouette", "skinning", "ssim",
+    "adam", "binning", "compositing", "compositing_extremes", "correctives", "finishing", "harmonics", "neighbors",
+    "network", "posing", "projection", "shading", "silhouette", "skinning", "ssim",
 )  # fmt: skip
 LEFT_OUT = "gsplat or thread or wrong or any_s or many_splats or refus or not_fit or nothing_to_do or in_parts"
 """Tests that do not concern the processor, or that take long where it is emulated."""

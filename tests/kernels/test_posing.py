@@ -6,8 +6,7 @@ import pytest
 import torch
 from torch.nn.functional import normalize
 
-from reference.correctives import correct
-from reference.shading import shade, tint
+from reference.finishing import finish
 from reference.skinning import skin
 from scgs_warp.ops import correctives, shading, skinning
 from scgs_warp.ops.activations import exponential, sigmoid
@@ -91,18 +90,10 @@ def binding_of(count: int, nodes: int, k: int) -> tuple[torch.Tensor, torch.Tens
 
 def twin(rest, nodes: torch.Tensor, pose: Pose, indices, weights, own=None) -> tuple[torch.Tensor, ...]:
     """Pose in float64 by the twins of the parts."""
-    means, quats, log_scales, logits, sh_dc, correctives, shading = rest
-    moved, turned, extras = skin(means, quats, nodes, pose, indices, weights)
-    own = turned if own is None else own
-    if correctives.shape[1]:
-        moved = correct(moved, correctives, quats, turned, own)
-    if pose.log_scales is not None:
-        log_scales = log_scales + extras
-    if pose.tints is not None:
-        sh_dc = tint(sh_dc, extras)
-    if shading.shape[1]:
-        sh_dc = shade(sh_dc, shading, quats, own)
-    return moved, turned, log_scales.exp(), logits.sigmoid(), sh_dc
+    moved, turned, extras = skin(rest[0], rest[1], nodes, pose, indices, weights)
+    log_scales, tints = (extras, None) if pose.tints is None else (None, extras)
+    means, *others = finish(moved, turned, tuple(rest), log_scales, tints, own)
+    return means, turned, *others
 
 
 def forms(device: str) -> list[str]:

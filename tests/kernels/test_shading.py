@@ -157,6 +157,12 @@ def test_a_tint_of_zero_and_a_non_finite_one_change_nothing(device, tint):
     assert torch.isfinite(tints.grad).all() and not tints.grad[1:].any()
 
 
+def test_a_tint_at_a_limit_learns_nothing(device, tint):
+    tints = torch.tensor([-3.0, -2.999, 0.999, 1.0])[:, None].repeat(1, 3).to(device).requires_grad_()
+    tint(torch.ones(4, 3, device=device), tints).sum().backward()
+    assert tints.grad.bool().all(dim=1).tolist() == [False, True, True, False] and not tints.grad[[0, 3]].any()
+
+
 @pytest.mark.parametrize("which", range(2))
 def test_wrong_shapes_of_tints_are_named(which):
     inputs = [torch.zeros(3, 3), torch.zeros(3, 3)]
