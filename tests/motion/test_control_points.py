@@ -232,6 +232,22 @@ def test_a_scene_from_before_correctives_still_opens(scene):
     torch.testing.assert_close(opened.gaussians_at(0.3).means, scene.gaussians_at(0.3).means, rtol=1e-5, atol=1e-6)
 
 
+def test_under_an_edit_learning_sees_what_is_drawn(scene):
+    """Shading and correctives follow the trained motion, not the edit, with gradients and without."""
+    gaussians, motion = scene.gaussians, scene.motion
+    with torch.no_grad():
+        own, edited = motion.poses(torch.tensor([0.2, 0.7]))
+        binding = motion.binding(gaussians)
+        drawn = motion.apply_pose(gaussians, edited, binding, own)
+        unedited = motion.apply_pose(gaussians, edited, binding)
+    learnt = motion.apply_pose(gaussians, edited, binding, own)
+    assert learnt.means.requires_grad and learnt.sh_dc.requires_grad
+    for name in ("means", "quats", "scales", "opacities", "sh_dc"):
+        torch.testing.assert_close(getattr(learnt, name), getattr(drawn, name), rtol=1e-4, atol=1e-5)
+    for name in ("means", "sh_dc"):
+        assert (getattr(drawn, name) - getattr(unedited, name)).abs().max() > 1e-3, name
+
+
 def test_neighbours_for_rigidity_are_found_anew_now_and_then():
     """At the first step, and at the first step with the term after each multiple of ``arap_refresh``."""
     motion = scenes.synthetic_scene("control-points", 60, 20, "cpu").motion
