@@ -55,7 +55,7 @@ def pack_weights(
     # In:
     panels: int,  # of the widest matrix
     adjoint: int,  # 1: pack for the adjoint of the layer before as well
-    table_in: wp.array2d[wp.int64],  # [L, 10]
+    table_in: wp.array2d[wp.int64],  # [L, 9]
     # Out:
     packed_out: wp.array[float],
 ):
@@ -83,7 +83,7 @@ def network_values(
     # In:
     size: int,  # rows a block
     keep: int,  # 1: hidden has room for every layer, for the adjoint; 0: for two
-    table_in: wp.array2d[wp.int64],  # [L, 10]
+    table_in: wp.array2d[wp.int64],  # [L, 9]
     packed_in: wp.array[float],
     inputs_in: wp.array3d[float],  # [panels, R, 32]
     # Out:

@@ -41,7 +41,7 @@ def network_adjoint(
     # In:
     size: int,  # rows a block
     begin: int,  # the first of the V rows
-    table_in: wp.array2d[wp.int64],  # [L, 10]
+    table_in: wp.array2d[wp.int64],  # [L, 9]
     packed_in: wp.array[float],
     hidden_in: wp.array3d[float],  # [L, R, width]
     v_values_in: wp.array2d[float],  # [n, out]
@@ -58,7 +58,7 @@ def network_inputs_adjoint(
     # In:
     size: int,  # rows a block
     begin: int,  # the first of the V rows
-    table_in: wp.array2d[wp.int64],  # [L, 10]
+    table_in: wp.array2d[wp.int64],  # [L, 9]
     packed_in: wp.array[float],
     v_hidden_in: wp.array3d[float],  # [L, V, width]
     # Out:
@@ -77,7 +77,7 @@ def network_weights_adjoint(
     parts: int,  # tasks that share a panel of outputs
     begin: int,  # the first of the V rows
     count: int,  # how many of them count
-    table_in: wp.array2d[wp.int64],  # [L, 10]
+    table_in: wp.array2d[wp.int64],  # [L, 9]
     inputs_in: wp.array3d[float],  # [panels, R, 32]
     hidden_in: wp.array3d[float],  # [L, R, width]
     v_hidden_in: wp.array3d[float],  # [L, V, width]

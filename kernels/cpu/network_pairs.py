@@ -39,7 +39,7 @@ def pack_weight_pairs(
     first: int,
     # In:
     panels: int,  # of the widest matrix
-    table_in: wp.array2d[wp.int64],  # [L, 10]
+    table_in: wp.array2d[wp.int64],  # [L, 9]
     # Out:
     packed_out: wp.array[int],
 ):
@@ -55,7 +55,7 @@ def network_adjoint_pairs(
     size: int,  # rows a block
     begin: int,  # the first of the V rows
     tiles: int,  # whether to use AMX
-    table_in: wp.array2d[wp.int64],  # [L, 10]
+    table_in: wp.array2d[wp.int64],  # [L, 9]
     packed_in: wp.array[int],
     inputs_in: wp.array3d[float],  # [panels, R, 32]
     hidden_in: wp.array3d[float],  # [L, R, width]
@@ -83,7 +83,7 @@ def network_weights_adjoint_pairs(
     begin: int,  # the first of the V rows
     count: int,  # how many of them count
     tiles: int,  # whether to use AMX
-    table_in: wp.array2d[wp.int64],  # [L, 10]
+    table_in: wp.array2d[wp.int64],  # [L, 9]
     input_rows_in: wp.array3d[int],  # [panels, V / 2, 32]
     hidden_rows_in: wp.array3d[int],  # [L - 1, V / 2, width]
     v_rows_in: wp.array3d[int],  # [L, V / 2, width]

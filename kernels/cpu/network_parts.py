@@ -15,29 +15,12 @@ wp.set_module_options({"enable_backward": False})
 
 # fmt: off
 @native_function("network_parts.h")
-def pack_panel_parts(layer: int, panel: int, table: wp.array2d[wp.int64], packed: wp.array[int]): ...
-
-
-@native_function("network_parts.h")
 def network_block_parts(
-    block: int, size: int, keep: int, table: wp.array2d[wp.int64], packed: wp.array[int], inputs: wp.array3d[float],
-    input_parts: wp.array4d[int], hidden_parts: wp.array4d[int], hidden: wp.array3d[float], out: wp.array2d[float],
+    block: int, size: int, keep: int, table: wp.array2d[wp.int64], inputs: wp.array3d[float],
+    input_parts: wp.array4d[int], hidden_parts: wp.array4d[int], weight_parts: wp.array2d[int],
+    hidden: wp.array3d[float], out: wp.array2d[float],
 ): ...
 # fmt: on
-
-
-@wp.kernel
-def pack_weight_parts(
-    first: int,
-    # In:
-    panels: int,  # of the widest layer's outputs
-    table_in: wp.array2d[wp.int64],  # [L, 10]
-    # Out:
-    packed_out: wp.array[int],
-):
-    """Pack weights in three parts, in panels of what each layer reads. Grid: L x panels."""
-    task = first + wp.tid()
-    pack_panel_parts(task // panels, task % panels, table_in, packed_out)
 
 
 @wp.kernel
@@ -46,18 +29,18 @@ def network_values_parts(
     # In:
     size: int,  # rows a block, a multiple of 32
     keep: int,  # 1: write the hidden values, for the adjoint
-    table_in: wp.array2d[wp.int64],  # [L, 10]
-    packed_in: wp.array[int],
+    table_in: wp.array2d[wp.int64],  # [L, 9]
     inputs_in: wp.array3d[float],  # [panels, R, 32]
     # Scratch:
     input_parts_tmp: wp.array4d[int],  # [3, panels, V, 16], V >= R, a multiple of 32
     hidden_parts_tmp: wp.array4d[int],  # [6, width / 32, V, 16] of two layers
+    weight_parts_tmp: wp.array2d[int],  # [blocks, 1536 P] P panels: the most that a layer reads
     # Out:
     hidden_out: wp.array3d[float],  # [L, R, width], each in panels, touched only with keep
     values_out: wp.array2d[float],  # [n, out], n <= R
 ):
     """Evaluate all layers for a block of rows. Grid: blocks."""
     network_block_parts(
-        first + wp.tid(), size, keep, table_in, packed_in, inputs_in,
-        input_parts_tmp, hidden_parts_tmp, hidden_out, values_out
+        first + wp.tid(), size, keep, table_in, inputs_in,
+        input_parts_tmp, hidden_parts_tmp, weight_parts_tmp, hidden_out, values_out
     )  # fmt: skip

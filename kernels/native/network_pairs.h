@@ -13,14 +13,20 @@ typedef unsigned vpu __attribute__((vector_size(LANES * 4), aligned(4)));
 
 enum { PAIRS = PANEL / 2 };  // of the columns of a panel
 
-// Round to the nearest bfloat16, ties to even; it is in the upper half. A NaN stays one.
+// Round to the nearest bfloat16, ties to even; it is in the lower half. A NaN stays one.
 static inline vp rounded(vn value) {
+#if defined(__AVX512BF16__)
+    typedef __bf16 halves __attribute__((vector_size(LANES * 2)));
+    typedef unsigned short shorts __attribute__((vector_size(LANES * 2)));
+    return __builtin_convertvector((shorts) __builtin_convertvector(value, halves), vp);
+#else
     const vp bits = (vp)value, up = bits + 0x7fffu + (bits >> 16 & 1u);
-    return value == value ? up : bits | 0x400000u;
+    return (value == value ? up : bits | 0x400000u) >> 16;
+#endif
 }
 
 // Round two numbers; the first is in the lower half of the result.
-static inline vp paired(vn first, vn second) { return rounded(first) >> 16 | (rounded(second) & 0xffff0000u); }
+static inline vp paired(vn first, vn second) { return rounded(first) | rounded(second) << 16; }
 
 static inline vn lower(vp pair) { return (vn)(pair << 16); }
 static inline vn upper(vp pair) { return (vn)(pair & 0xffff0000u); }
@@ -185,32 +191,38 @@ static inline void copy_part(
         for (int c = 0; c < columns; ++c) to[j * to_stride + c] = from[j * from_stride + c];
 }
 
-// Compute 32 x 32 gradients of weights by tiles: the sums over pairs of rows of v times x, PANEL apart. If ``first``,
-// the sums continue those at ``gradient``, of which ``rows`` x ``columns`` exist.
+// Turn the columns of rows of pairs into rows, 16 pairs at a time: what a tile of a left factor holds.
+static inline void turn_pairs(const unsigned* v, int pairs, unsigned* turned) {
+    for (int i = 0; i < pairs; i += SIDE)
+        for (int half = 0; half < PANEL; half += SIDE, turned += SIDE * SIDE) {
+            vf rows[SIDE];
+            for (int k = 0; k < SIDE; ++k)
+                rows[k] = i + k < pairs ? load((const float*)v + (i + k) * PANEL + half, 16) : vf{};
+            transpose(rows);
+            __builtin_memcpy(turned, rows, sizeof(rows));
+        }
+}
+
+// Compute 32 x 32 gradients of weights by tiles: the sums over pairs of rows of the turned v times x, PANEL apart. If
+// ``first``, the sums continue those at ``gradient``, of which ``rows`` x ``columns`` exist.
 static inline void tiled_gradients(
-    const unsigned* v, const unsigned* x, int pairs, int first, float* gradient, long long stride, int rows, int columns
+    const unsigned* turned, const unsigned* x, int pairs, int first, float* gradient, long long stride, int rows,
+    int columns
 ) {
     alignas(64) float sums[PANEL * PANEL] = {};
-    alignas(64) unsigned left[PANEL * SIDE], rest[SIDE * PANEL];
+    alignas(64) unsigned rest[SIDE * PANEL];
     if (first) copy_part(gradient, stride, sums, PANEL, rows, columns);
     const Tiles registers = {};
     registers.begin(sums);
     for (int i = 0; i < pairs; i += SIDE) {
         const int own = pairs - i < SIDE ? pairs - i : SIDE;
-        for (int half = 0; half < PANEL; half += SIDE) {  // rows of pairs become columns
-            vf turned[SIDE];
-            for (int k = 0; k < SIDE; ++k)
-                turned[k] = k < own ? load((const float*)v + (i + k) * PANEL + half, 16) : vf{};
-            transpose(turned);
-            __builtin_memcpy(left + half * SIDE, turned, sizeof(turned));
-        }
         const unsigned* right = x + (long long)i * PANEL;
         if (own < SIDE) {  // what lies behind may be anything
             __builtin_memset(rest, 0, sizeof(rest));
             __builtin_memcpy(rest, right, own * PANEL * sizeof(unsigned));
             right = rest;
         }
-        registers.add(left, right);
+        registers.add(turned + (long long)i * PANEL, right);
     }
     registers.end(sums);
     copy_part(sums, PANEL, gradient, stride, rows, columns);
@@ -244,6 +256,8 @@ WHOLE_REGISTERS static inline void network_panel_adjoint_pairs(
         for (int j = 0; j < n_out; ++j) to[j] = sums[j];
     }
     const int before = panels(from_inputs), all = before + panels(own[HIDDEN]);
+    alignas(64) unsigned turned[NETWORK_ADJOINT_ROWS / 2 * PANEL];
+    if (tiles) turn_pairs(v, pairs, turned);
     for (int q = part; q < all; q += parts) {
         const bool of_inputs = q < before;
         const unsigned* x = of_inputs ? (unsigned*)input_rows.data + (long long)q * own_rows * PAIRS
@@ -252,7 +266,7 @@ WHOLE_REGISTERS static inline void network_panel_adjoint_pairs(
         const int column = of_inputs ? q * PANEL : from_inputs + (q - before) * PANEL;
         const int n = of_inputs && from_inputs - column < PANEL ? from_inputs - column : PANEL;
         if (tiles) {
-            tiled_gradients(v, x, pairs, first, gradient + (long long)panel * PANEL * in + column, in, n_out, n);
+            tiled_gradients(turned, x, pairs, first, gradient + (long long)panel * PANEL * in + column, in, n_out, n);
             continue;
         }
         for (int j = 0; j < n_out; j += ROWS)

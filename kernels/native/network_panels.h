@@ -19,7 +19,6 @@ enum {
     PACKED_ADJOINT,   // for the adjoint of the layer before (-1: not wanted),
     PACKED_INPUTS,    // for the adjoint of the inputs (-1: not wanted)
     WEIGHTS_ADJOINT,  // address of the gradient of the weights, which that of the bias follows
-    PACKED_PARTS,     // offset of the layer's weights packed in bfloat16 parts, for values
     TABLE_COLUMNS,
 };
 

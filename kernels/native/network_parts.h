@@ -29,16 +29,12 @@ static inline void split_row(vf first, vf second, unsigned* to, long long apart)
     for (int part = 0; part < PARTS; ++part) store((float*)(to + part * apart), (vf)parts[part], SIDE);
 }
 
-// Pack one panel of a layer's weights in parts: for each panel of what the layer reads, pair (k, k + 16), column j.
-static inline void pack_panel_parts(
-    int layer, int panel, const wp::array_t<wp::int64>& table, wp::array_t<int>& packed
-) {
-    const long long* own = (const long long*)table.data + (long long)layer * TABLE_COLUMNS;
+// Cut the weights of one panel of a layer's outputs into parts: for each panel of what the layer reads, pair (k, k +
+// 16), column j. This takes less time than to read them from memory after another kernel has cut them.
+static inline void weights_in_parts(const long long* own, int panel, unsigned* to) {
     const int inputs = (int)own[INPUTS], hidden = (int)own[HIDDEN], out = (int)own[OUTPUTS], in = inputs + hidden;
-    if (panel >= panels(out)) return;
     const int reads = panels(inputs) + panels(hidden);
     const long long apart = (long long)reads * PAIR_COLUMNS * PANEL;
-    unsigned* to = (unsigned*)packed.data + own[PACKED_PARTS] + panel * PARTS * apart;
     for (int q = 0; q < reads; ++q) {
         const bool of_inputs = q < panels(inputs);
         const int column = of_inputs ? q * PANEL : inputs + (q - panels(inputs)) * PANEL;
@@ -87,8 +83,8 @@ static inline void add_parts(
 
 // Take a block of rows through all layers. ``hidden_parts`` holds the values of two layers.
 WHOLE_REGISTERS static inline void network_block_parts(
-    int block, int size, int keep, const wp::array_t<wp::int64>& table, const wp::array_t<int>& packed,
-    const wp::array_t<float>& inputs, wp::array_t<int>& input_parts, wp::array_t<int>& hidden_parts,
+    int block, int size, int keep, const wp::array_t<wp::int64>& table, const wp::array_t<float>& inputs,
+    wp::array_t<int>& input_parts, wp::array_t<int>& hidden_parts, wp::array_t<int>& weight_parts,
     wp::array_t<float>& hidden, wp::array_t<float>& out
 ) {
     const int layers = table.shape.dims[0], rows = inputs.shape.dims[1], room = input_parts.shape.dims[2];
@@ -101,6 +97,7 @@ WHOLE_REGISTERS static inline void network_block_parts(
             unsigned* to = (unsigned*)input_parts.data + ((long long)q * room + i) * SIDE;
             split_row(load(from, SIDE), load(from + SIDE, SIDE), to, inputs_apart);
         }
+    unsigned* weights = (unsigned*)weight_parts.data + (long long)block * weight_parts.shape.dims[1];
     const Tiles registers = {};
     alignas(64) float start[PANEL * PANEL], sums[PANEL * PANEL];
     for (int l = 0; l < layers; ++l) {
@@ -112,7 +109,7 @@ WHOLE_REGISTERS static inline void network_block_parts(
         const unsigned* before = (unsigned*)hidden_parts.data + PARTS * hidden_apart * (l - 1 & 1);
         unsigned* after = (unsigned*)hidden_parts.data + PARTS * hidden_apart * (l & 1);
         for (int p = 0; p < panels(outputs); ++p) {
-            const unsigned* weights = (unsigned*)packed.data + own[PACKED_PARTS] + p * PARTS * apart;
+            weights_in_parts(own, p, weights);
             for (int r = 0; r < PANEL; ++r)
                 for (int c = 0; c < PANEL; ++c)
                     start[r * PANEL + c] = p * PANEL + c < outputs ? bias[p * PANEL + c] : 0.0f;
@@ -152,10 +149,8 @@ WHOLE_REGISTERS static inline void network_block_parts(
     }
 }
 #else  // never called
-static inline void pack_panel_parts(int, int, const wp::array_t<wp::int64>&, wp::array_t<int>&) {}
-
 static inline void network_block_parts(
-    int, int, int, const wp::array_t<wp::int64>&, const wp::array_t<int>&, const wp::array_t<float>&, wp::array_t<int>&,
+    int, int, int, const wp::array_t<wp::int64>&, const wp::array_t<float>&, wp::array_t<int>&, wp::array_t<int>&,
     wp::array_t<int>&, wp::array_t<float>&, wp::array_t<float>&
 ) {}
 #endif

@@ -14,7 +14,8 @@ from ..kernels.cpu import network as kernels
 from ..kernels.cpu import network_adjoint as kernels_adjoint
 from ..kernels.cpu import network_pairs as kernels_pairs
 from ..kernels.cpu import network_parts as kernels_parts
-from ..kernels.types import NETWORK_BLOCK, NETWORK_PANEL
+from ..kernels.types import NETWORK_ADJOINT_ROWS, NETWORK_BLOCK, NETWORK_PANEL
+from ..runtime import environment
 from ..runtime.launch import launch
 from ..runtime.matrix_tiles import may_use_tiles
 
@@ -22,14 +23,13 @@ ROW_MULTIPLE = 8
 """Number to a multiple of which the rows of every matrix are rounded up."""
 ROWS_AT_ONCE = 8192
 """Number of rows evaluated at once without gradients: hidden values stay in the cache from layer to layer."""
-ADJOINT_ROWS_AT_ONCE = 2048
-"""Number of rows of the adjoint evaluated at once. A multiple of 32, it does not affect the result."""
+ADJOINT_ROWS_AT_ONCE = NETWORK_ADJOINT_ROWS
+"""Number of rows of the adjoint evaluated at once. It does not affect the result."""
 FLOAT_BYTES = 4
 BFLOAT16_PARTS = 3
 """Number of bfloat16 numbers whose sum stands for a float32 number."""
-TILED_BLOCK, MANY_BLOCKS = 128, 4
-"""Number of rows that one thread takes through all layers by tiles, so that it reads the weights once for all of them,
-and the number of such blocks from which on they are this large."""
+LARGEST_TILED_BLOCK = 512
+"""Largest number of rows that a thread takes through all layers by tiles at once; its scratch stays in the cache."""
 PARTS = 2
 """Number of tasks that share a panel of a layer's weight gradients."""
 
@@ -49,11 +49,9 @@ class Layout(NamedTuple):
     """Where the layers' weights and gradients are in memory; it depends on their shapes alone."""
 
     table: np.ndarray
-    """[layers, 10] int64, as the kernels read it, without addresses."""
+    """[layers, 9] int64, as the kernels read it, without addresses."""
     packed: int
     """Number of packed values."""
-    parts: int
-    """Number of pairs of packed bfloat16 parts."""
     gradients: np.ndarray
     """[layers] byte at which each layer's gradients begin: those of the weights, then those of the biases."""
     sizes: list[int]
@@ -63,20 +61,19 @@ class Layout(NamedTuple):
 @functools.lru_cache(maxsize=32)
 def _layout(shapes: tuple[tuple[int, int], ...], inputs: int, inputs_adjoint: bool) -> Layout:
     """Lay out layers of ``shapes`` (out, in); the other arguments are those of :class:`Layers`."""
-    rows, sizes, at, parts, before = [], [], 0, 0, 0
+    rows, sizes, at, before = [], [], 0, 0
     for out, columns in shapes:
         own = columns - before
         panels = -(-out // NETWORK_PANEL)
         adjoint = at + panels * NETWORK_PANEL * columns
         to_inputs = adjoint + before * panels * NETWORK_PANEL
         wanted = inputs_adjoint and own > 0
-        rows.append([0, 0, own, before, out, at, adjoint if before else -1, to_inputs if wanted else -1, 0, parts])
+        rows.append([0, 0, own, before, out, at, adjoint if before else -1, to_inputs if wanted else -1, 0])
         at = to_inputs + (-(-own // NETWORK_PANEL) * NETWORK_PANEL * out if wanted else 0)
-        parts += BFLOAT16_PARTS * panels * sum(-(-n // NETWORK_PANEL) for n in (own, before)) * NETWORK_PANEL**2 // 2
         sizes += [out * columns, out]
         before = out
     begins = np.cumsum([0, *sizes])[:-1:2] * FLOAT_BYTES
-    return Layout(np.array(rows, np.int64), at, parts, begins, sizes)
+    return Layout(np.array(rows, np.int64), at, begins, sizes)
 
 
 class Layers:
@@ -108,26 +105,24 @@ class Layers:
         table = self.layout.table.copy()
         table[:, 0], table[:, 1] = [w.data_ptr() for w in weights], [b.data_ptr() for b in biases]
         self.table = torch.from_numpy(table)
-        self.packed = torch.empty(self.layout.packed)
-        widest = max(self.panels, -(-inputs // NETWORK_PANEL)) if inputs_adjoint else self.panels
+        self._widest = max(self.panels, -(-inputs // NETWORK_PANEL)) if inputs_adjoint else self.panels
         self.pairs = torch.empty(self.layout.packed // 2 if bfloat16 and not inputs_adjoint else 0, dtype=torch.int32)
         """Weights in pairs of bfloat16, for the adjoint; empty: it is computed in float32."""
-        paired, tasks = len(self.pairs) > 0, len(weights) * widest
-        self.parts = torch.empty(self.layout.parts if pair_products() > 1 else 0, dtype=torch.int32)
-        """Weights in three parts of bfloat16, for the values; empty: they are computed without tiles."""
-        if len(self.parts):
-            launch(
-                kernels_parts.pack_weight_parts,
-                len(weights) * self.panels,
-                self.panels,
-                self.table,
-                self.parts,
-                grain=1,
-            )
-        if not (len(self.parts) and paired):
-            launch(kernels.pack_weights, tasks, widest, int(not paired), self.table, self.packed, grain=1)
-        if paired:
-            launch(kernels_pairs.pack_weight_pairs, tasks, widest, self.table, self.pairs, grain=1)
+        self.tiled = pair_products() > 1
+        """Whether the values are computed by tiles, from the weights as they are."""
+        if len(self.pairs):
+            launch(kernels_pairs.pack_weight_pairs, *self._tasks(), self.table, self.pairs, grain=1)
+        self.packed = None if self.tiled else self._pack()
+
+    def _tasks(self) -> tuple[int, int]:
+        """Return the number of panels of all matrices, each counted as the widest, and that of the widest."""
+        return len(self.weights) * self._widest, self._widest
+
+    def _pack(self) -> Tensor:
+        """Return the weights packed in float32, with those for the adjoint unless there are pairs."""
+        packed = torch.empty(self.layout.packed)
+        launch(kernels.pack_weights, *self._tasks(), int(not len(self.pairs)), self.table, packed, grain=1)
+        return packed
 
     def values(self, where: Tensor, when: Tensor, keep: bool) -> tuple[Tensor, Tensor, Tensor]:
         """Return the inputs and the hidden values in panels, and the outputs [T M, out]."""
@@ -136,7 +131,7 @@ class Layers:
         inputs = torch.empty(-(-self.inputs // NETWORK_PANEL), rows, NETWORK_PANEL)
         launch(kernels.pack_inputs, rows, where, when, inputs)
         out = torch.empty(count, self.outputs)
-        if len(self.parts):
+        if self.tiled:
             hidden = torch.empty(len(self.weights) if keep else 0, rows, self.panels * NETWORK_PANEL)
             self._values_in_parts(inputs, hidden, out)
             return inputs, hidden, out
@@ -148,16 +143,19 @@ class Layers:
     def _values_in_parts(self, inputs: Tensor, hidden: Tensor, out: Tensor) -> None:
         """Write the outputs, and the hidden values if ``hidden`` has room for them."""
         rows, keep = inputs.shape[1], int(len(hidden) > 0)
-        size = TILED_BLOCK if rows >= MANY_BLOCKS * TILED_BLOCK else TILED_BLOCK // 2
-        room, pairs = -(-rows // NETWORK_BLOCK) * NETWORK_BLOCK, NETWORK_PANEL // 2
-        scratch = [
-            torch.empty(count, panels, room, pairs, dtype=torch.int32)
-            for count, panels in ((BFLOAT16_PARTS, len(inputs)), (2 * BFLOAT16_PARTS, self.panels))
-        ]
-        weights = self.table, self.parts
+        # One block for each thread: a block cuts all weights into parts.
+        shared = -(-rows // (environment.thread_count() * NETWORK_BLOCK)) * NETWORK_BLOCK
+        size = max(min(shared, LARGEST_TILED_BLOCK), NETWORK_BLOCK)
+        blocks, room, pairs = -(-rows // size), -(-rows // NETWORK_BLOCK) * NETWORK_BLOCK, NETWORK_PANEL // 2
+        reads = len(inputs) + self.panels
+        shapes = (
+            (BFLOAT16_PARTS, len(inputs), room, pairs),
+            (2 * BFLOAT16_PARTS, self.panels, room, pairs),
+            (blocks, BFLOAT16_PARTS * reads * NETWORK_PANEL * pairs),
+        )
+        scratch = (torch.empty(shape, dtype=torch.int32) for shape in shapes)
         launch(
-            kernels_parts.network_values_parts, -(-rows // size), size, keep, *weights, inputs, *scratch, hidden, out,
-            grain=1,
+            kernels_parts.network_values_parts, blocks, size, keep, self.table, inputs, *scratch, hidden, out, grain=1
         )  # fmt: skip
 
     def gradients(
@@ -186,10 +184,11 @@ class Layers:
     def _backward(self, table: Tensor, inputs: Tensor, hidden: Tensor, v_out: Tensor, v_inputs: Tensor | None) -> None:
         """Write the gradients of the parameters to the table's addresses, and those of the inputs to ``v_inputs``."""
         layers, rows, width = hidden.shape
+        packed = self._pack() if self.packed is None else self.packed
         v_hidden = torch.empty(layers, min(rows, ADJOINT_ROWS_AT_ONCE), width)
         for begin in range(0, rows, ADJOINT_ROWS_AT_ONCE):
             own = min(ADJOINT_ROWS_AT_ONCE, rows - begin)
-            grid, where = -(-own // NETWORK_BLOCK), (NETWORK_BLOCK, begin, table, self.packed)
+            grid, where = -(-own // NETWORK_BLOCK), (NETWORK_BLOCK, begin, table, packed)
             launch(kernels_adjoint.network_adjoint, grid, *where, hidden, v_out, v_hidden, grain=1)
             if v_inputs is not None:
                 launch(kernels_adjoint.network_inputs_adjoint, grid, *where, v_hidden, v_inputs, grain=1)
