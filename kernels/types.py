@@ -72,8 +72,8 @@ NETWORK_PANEL = 32
 
 NETWORK_BLOCK = 32
 """Number of rows that one grid index takes through all layers on a CPU; matrices have a multiple of 8 rows."""
-NETWORK_ADJOINT_ROWS = 2048
-"""Largest number of rows of the network's adjoint in one launch; a multiple of 32."""
+NETWORK_ADJOINT_ROWS = 1024
+"""Largest number of rows of the network's adjoint in one launch; a multiple of 32. Its stack grows with it."""
 
 SSIM_BAND = 64
 """Number of rows in a band, which one grid index of the CPU's photometric loss computes; it also blurs 10 rows

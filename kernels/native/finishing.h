@@ -6,7 +6,7 @@
 #include "shading.h"
 
 // Quaternions of a block: at rest, posed, and those that correctives and shading follow (null: the posed ones).
-struct Turned {
+struct Quaternions {
     const vf *rest, *posed, *own;
 };
 
@@ -15,7 +15,7 @@ struct Turned {
 ALWAYS_INLINE vf finish(
     int begin, int rows, const wp::array_t<wp::vec3>& log_scales, const wp::array_t<float>& opacity_logits,
     const wp::array_t<wp::vec3>& sh_dc, const wp::array_t<float>& correctives, const wp::array_t<float>& shading,
-    const Turned& quat, const vf* extra, int extras, vf* mean, vf* scale, vf* color
+    const Quaternions& quat, const vf* extra, int extras, vf* mean, vf* scale, vf* color
 ) {
     read_vectors(sh_dc.data, begin, rows, 3, color);
     if (extras == EXTRAS_TINTS)
@@ -58,7 +58,7 @@ static inline void finish_block(
         read_vectors(quats_t.data, begin, rows, 4, posed);
         if (has_own) read_vectors(quats_own.data, begin, rows, 4, own);
     }
-    const Turned quat{rest, posed, has_own ? own : nullptr};
+    const Quaternions quat{rest, posed, has_own ? own : nullptr};
     const vf opacity = finish(
         begin, rows, log_scales, opacity_logits, sh_dc, correctives, shading, quat, extra, extras, mean, scale, color
     );
@@ -70,6 +70,7 @@ static inline void finish_block(
 
 // Write the gradients of what changed the results. Those of means pass unchanged, and those of added log scales are
 // those of the log scales: both are left to the caller.
+// A result without a gradient (null) passes none on.
 static inline void finish_block_adjoint(
     int begin, const wp::array_t<wp::vec3>& scales_t, const wp::array_t<float>& opacities_t,
     const wp::array_t<wp::vec3>& sh_dc, const wp::array_t<float>& correctives, const wp::array_t<float>& shading,
@@ -81,15 +82,20 @@ static inline void finish_block_adjoint(
     wp::array_t<float>& v_correctives, wp::array_t<float>& v_shading, wp::array_t<wp::vec3>& v_tints
 ) {
     const int rows = scales_t.shape[0] - begin < 16 ? scales_t.shape[0] - begin : 16;
-    const bool displaced = correctives.shape[1], shaded = shading.shape[1], tinted = extras == EXTRAS_TINTS;
+    const bool displaced = correctives.shape[1] && v_means_t.data;
+    const bool shaded = shading.shape[1] && v_sh_dc_t.data, tinted = extras == EXTRAS_TINTS && v_sh_dc_t.data;
     // 1. Activations.
-    vf scale[3], v_scale[3];
-    read_vectors(scales_t.data, begin, rows, 3, scale);
-    read_vectors(v_scales_t.data, begin, rows, 3, v_scale);
-    for (int c = 0; c < 3; ++c) v_scale[c] = v_scale[c] * scale[c];
-    write_vectors(v_log_scales.data, begin, rows, 3, v_scale);
-    const vf opacity = load(opacities_t.data + begin, rows);
-    store(v_opacity_logits.data + begin, load(v_opacities_t.data + begin, rows) * ((1.0f - opacity) * opacity), rows);
+    if (v_scales_t.data) {
+        vf scale[3], v_scale[3];
+        read_vectors(scales_t.data, begin, rows, 3, scale);
+        read_vectors(v_scales_t.data, begin, rows, 3, v_scale);
+        for (int c = 0; c < 3; ++c) v_scale[c] = v_scale[c] * scale[c];
+        write_vectors(v_log_scales.data, begin, rows, 3, v_scale);
+    }
+    if (v_opacities_t.data) {
+        const vf opacity = load(opacities_t.data + begin, rows), v_opacity = load(v_opacities_t.data + begin, rows);
+        store(v_opacity_logits.data + begin, v_opacity * ((1.0f - opacity) * opacity), rows);
+    }
     // 2. Colours: first as shading found them, then as tints did.
     vf tint[3], factor[3], color[3], shown[3], v_color[3];
     if (tinted || shaded) {

@@ -11,8 +11,6 @@
 typedef unsigned vp __attribute__((vector_size(LANES * 4)));
 typedef unsigned vpu __attribute__((vector_size(LANES * 4), aligned(4)));
 
-enum { PAIRS = PANEL / 2 };  // of the columns of a panel
-
 // Round to the nearest bfloat16, ties to even; it is in the lower half. A NaN stays one.
 static inline vp rounded(vn value) {
 #if defined(__AVX512BF16__)
@@ -257,7 +255,7 @@ WHOLE_REGISTERS static inline void network_panel_adjoint_pairs(
     }
     const int before = panels(from_inputs), all = before + panels(own[HIDDEN]);
     alignas(64) unsigned turned[NETWORK_ADJOINT_ROWS / 2 * PANEL];
-    if (tiles) turn_pairs(v, pairs, turned);
+    if (tiles && part < all) turn_pairs(v, pairs, turned);
     for (int q = part; q < all; q += parts) {
         const bool of_inputs = q < before;
         const unsigned* x = of_inputs ? (unsigned*)input_rows.data + (long long)q * own_rows * PAIRS

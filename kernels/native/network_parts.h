@@ -2,19 +2,18 @@
 //
 // A number is the sum of three bfloat16 parts, which have the first, the second and the last eight of its 24 bits. Of
 // the nine products of the parts of two numbers, six are larger than the rounding of float32 (Henry, Tang and Heinecke
-// 2019). A row's values depend neither on other rows nor on how the rows are cut into blocks.
+// 2019). Subnormal parts count as zero. A row's values depend neither on other rows nor on how the rows are cut into
+// blocks.
 #pragma once
 #include "network_tiles.h"
 #include "shuffles.h"
 
 #if defined(__AMX_BF16__) && defined(__AVX512F__)
-typedef unsigned vu __attribute__((vector_size(64)));
-
-enum { PARTS = 3, PAIR_COLUMNS = PANEL / 2 };
+enum { BFLOAT16_PARTS = 3 };
 
 // Cut two vectors into parts, and pair the parts; the first is in the lower halves.
 static inline void split(vf first, vf second, vu* parts) {
-    for (int part = 0; part < PARTS; ++part) {
+    for (int part = 0; part < BFLOAT16_PARTS; ++part) {
         const vu a = (vu)first & 0xffff0000u, b = (vu)second & 0xffff0000u;
         parts[part] = a >> 16 | b;
         first -= (vf)a;
@@ -24,9 +23,9 @@ static inline void split(vf first, vf second, vu* parts) {
 
 // Cut a row of a panel into parts, ``apart`` numbers apart.
 static inline void split_row(vf first, vf second, unsigned* to, long long apart) {
-    vu parts[PARTS];
+    vu parts[BFLOAT16_PARTS];
     split(first, second, parts);
-    for (int part = 0; part < PARTS; ++part) store((float*)(to + part * apart), (vf)parts[part], SIDE);
+    for (int part = 0; part < BFLOAT16_PARTS; ++part) store((float*)(to + part * apart), (vf)parts[part], SIDE);
 }
 
 // Cut the weights of one panel of a layer's outputs into parts: for each panel of what the layer reads, pair (k, k +
@@ -34,25 +33,25 @@ static inline void split_row(vf first, vf second, unsigned* to, long long apart)
 static inline void weights_in_parts(const long long* own, int panel, unsigned* to) {
     const int inputs = (int)own[INPUTS], hidden = (int)own[HIDDEN], out = (int)own[OUTPUTS], in = inputs + hidden;
     const int reads = panels(inputs) + panels(hidden);
-    const long long apart = (long long)reads * PAIR_COLUMNS * PANEL;
+    const long long apart = (long long)reads * PAIRS * PANEL;
     for (int q = 0; q < reads; ++q) {
         const bool of_inputs = q < panels(inputs);
         const int column = of_inputs ? q * PANEL : inputs + (q - panels(inputs)) * PANEL;
         const int n = (of_inputs ? inputs : in) - column;
         for (int half = 0; half < PANEL; half += SIDE) {
-            vf turned[PARTS][SIDE];
+            vf turned[BFLOAT16_PARTS][SIDE];
             for (int j = 0; j < SIDE; ++j) {
                 const int row = panel * PANEL + half + j;
                 const float* from = (const float*)own[WEIGHTS] + (long long)row * in + column;
-                vu parts[PARTS] = {};
+                vu parts[BFLOAT16_PARTS] = {};
                 if (row < out)
                     split(
                         load(from, n < SIDE ? n : SIDE),
                         n > SIDE ? load(from + SIDE, n < PANEL ? n - SIDE : SIDE) : vf{}, parts
                     );
-                for (int part = 0; part < PARTS; ++part) turned[part][j] = (vf)parts[part];
+                for (int part = 0; part < BFLOAT16_PARTS; ++part) turned[part][j] = (vf)parts[part];
             }
-            for (int part = 0; part < PARTS; ++part) {
+            for (int part = 0; part < BFLOAT16_PARTS; ++part) {
                 transpose(turned[part]);
                 for (int k = 0; k < SIDE; ++k)
                     store((float*)(to + part * apart + (q * SIDE + k) * PANEL + half), turned[part][k], SIDE);
@@ -81,23 +80,27 @@ static inline void add_parts(
     registers.add();
 }
 
-// Take a block of rows through all layers. ``hidden_parts`` holds the values of two layers.
+// Take a block of rows through all layers. Scratch has slots for blocks that run at the same time, and ``hidden_parts``
+// has room for two layers.
 WHOLE_REGISTERS static inline void network_block_parts(
     int block, int size, int keep, const wp::array_t<wp::int64>& table, const wp::array_t<float>& inputs,
     wp::array_t<int>& input_parts, wp::array_t<int>& hidden_parts, wp::array_t<int>& weight_parts,
     wp::array_t<float>& hidden, wp::array_t<float>& out
 ) {
-    const int layers = table.shape.dims[0], rows = inputs.shape.dims[1], room = input_parts.shape.dims[2];
+    const int layers = table.shape.dims[0], rows = inputs.shape.dims[1];
     const int begin = block * size, end = begin + size < rows ? begin + size : rows, count = out.shape.dims[0];
-    const long long inputs_apart = (long long)input_parts.shape.dims[1] * room * SIDE;
-    const long long hidden_apart = (long long)hidden_parts.shape.dims[1] * room * SIDE;
+    const long long slot = block % weight_parts.shape.dims[0], panel_size = (long long)size * SIDE;
+    const long long inputs_apart = inputs.shape.dims[0] * panel_size;
+    const long long hidden_apart = hidden_parts.shape.dims[1] / (2 * BFLOAT16_PARTS);
+    unsigned* own_inputs = (unsigned*)input_parts.data + slot * input_parts.shape.dims[1];
+    unsigned* own_hidden = (unsigned*)hidden_parts.data + slot * hidden_parts.shape.dims[1];
+    unsigned* weights = (unsigned*)weight_parts.data + slot * weight_parts.shape.dims[1];
     for (int q = 0; q < inputs.shape.dims[0]; ++q)
         for (int i = begin; i < end; ++i) {
             const float* from = inputs.data + ((long long)q * rows + i) * PANEL;
-            unsigned* to = (unsigned*)input_parts.data + ((long long)q * room + i) * SIDE;
+            unsigned* to = own_inputs + q * panel_size + (i - begin) * SIDE;
             split_row(load(from, SIDE), load(from + SIDE, SIDE), to, inputs_apart);
         }
-    unsigned* weights = (unsigned*)weight_parts.data + (long long)block * weight_parts.shape.dims[1];
     const Tiles registers = {};
     alignas(64) float start[PANEL * PANEL], sums[PANEL * PANEL];
     for (int l = 0; l < layers; ++l) {
@@ -105,9 +108,9 @@ WHOLE_REGISTERS static inline void network_block_parts(
         const float* bias = (const float*)own[BIAS];
         const int from_inputs = panels(own[INPUTS]), reads = from_inputs + panels(own[HIDDEN]);
         const int outputs = (int)own[OUTPUTS];
-        const long long apart = (long long)reads * PAIR_COLUMNS * PANEL;
-        const unsigned* before = (unsigned*)hidden_parts.data + PARTS * hidden_apart * (l - 1 & 1);
-        unsigned* after = (unsigned*)hidden_parts.data + PARTS * hidden_apart * (l & 1);
+        const long long apart = (long long)reads * PAIRS * PANEL;
+        const unsigned* before = own_hidden + BFLOAT16_PARTS * hidden_apart * (l - 1 & 1);
+        unsigned* after = own_hidden + BFLOAT16_PARTS * hidden_apart * (l & 1);
         for (int p = 0; p < panels(outputs); ++p) {
             weights_in_parts(own, p, weights);
             for (int r = 0; r < PANEL; ++r)
@@ -117,11 +120,11 @@ WHOLE_REGISTERS static inline void network_block_parts(
                 registers.begin(start);
                 for (int k = 0; k < reads; ++k) {
                     const bool of_inputs = k < from_inputs;
-                    const unsigned* from = of_inputs ? (unsigned*)input_parts.data : before;
+                    const unsigned* from = of_inputs ? own_inputs : before;
                     const int panel = of_inputs ? k : k - from_inputs;
                     add_parts(
-                        registers, from + ((long long)panel * room + i) * SIDE, of_inputs ? inputs_apart : hidden_apart,
-                        weights + k * PAIR_COLUMNS * PANEL, apart
+                        registers, from + panel * panel_size + (i - begin) * SIDE,
+                        of_inputs ? inputs_apart : hidden_apart, weights + k * PAIRS * PANEL, apart
                     );
                 }
                 registers.end(sums);
@@ -138,7 +141,7 @@ WHOLE_REGISTERS static inline void network_block_parts(
                         const vf sum = load(sums + r * PANEL + v * SIDE, SIDE);
                         value[v] = sum < 0.0f ? vf{} : sum;  // NaN is kept
                     }
-                    split_row(value[0], value[1], after + ((long long)p * room + i + r) * SIDE, hidden_apart);
+                    split_row(value[0], value[1], after + p * panel_size + (i - begin + r) * SIDE, hidden_apart);
                     if (!keep) continue;
                     const long long plane = (long long)rows * hidden.shape.dims[2];
                     float* to = hidden.data + plane * l + ((long long)p * rows + i + r) * PANEL;

@@ -6,7 +6,7 @@
 #pragma once
 #include "network_panels.h"
 
-enum { SIDE = 16 };  // rows of a tile, and 32-bit columns
+enum { SIDE = 16, PAIRS = PANEL / 2 };  // rows of a tile, and 32-bit columns; pairs of the columns of a panel
 
 #if defined(__AMX_BF16__) && defined(__AVX512F__)
 enum { HAS_TILES = 1 };

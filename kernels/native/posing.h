@@ -28,7 +28,7 @@ static inline void pose_block(
         // 2. Displace, tint, shade and activate.
         vf own[4], scale[3], color[3];
         if (has_own) read_vectors(quats_own.data, begin, rows, 4, own);
-        const Turned quat{rest, to.quat, has_own ? own : nullptr};
+        const Quaternions quat{rest, to.quat, has_own ? own : nullptr};
         const vf opacity = finish(
             begin, rows, log_scales, opacity_logits, sh_dc, correctives, shading, quat, to.extra, extras, to.mean,
             scale, color

@@ -49,9 +49,11 @@ def finish(
         get none.
 
     Raises:
-        ValueError: a shape is wrong, or there are both log scales and tints.
+        ValueError: a shape or the form is wrong, or there are both log scales and tints.
     """
     _check(means, quats_t, rest, log_scales, tints, own)
+    if form not in ("auto", "plain", "cpu") or (form == "cpu" and means.device.type != "cpu"):
+        raise ValueError(f"form must be auto, plain or, on a CPU, cpu, got {form!r} on {means.device}")
     if form == "plain" or (form == "auto" and means.device.type != "cpu"):
         return _in_parts(means, quats_t, rest, log_scales, tints, own)
     _, quats, rest_scales, logits, sh_dc, correctives, shading = rest
@@ -96,6 +98,7 @@ class _Finish(torch.autograd.Function):
         tints = extras if kind == TINTS else None
         ctx.save_for_backward(scales, opacities, sh_dc, correctives, shading, tints, quats, quats_t, own)
         ctx.kind = kind
+        ctx.set_materialize_grads(False)
         return outputs
 
     @staticmethod
@@ -103,11 +106,13 @@ class _Finish(torch.autograd.Function):
     def backward(ctx: Any, *gradients):  # type: ignore[override]
         scales, opacities, sh_dc, correctives, shading, tints, quats, quats_t, own = ctx.saved_tensors
         v_means, v_scales, v_opacities, v_colors = (None if v is None else v.contiguous() for v in gradients)
-        v_log_scales, v_logits = torch.empty_like(scales), torch.empty_like(opacities)
-        v_correctives = torch.empty_like(correctives) if correctives.shape[1] else None
-        v_shading = torch.empty_like(shading) if shading.shape[1] else None
-        v_tints = None if tints is None else torch.empty_like(tints)
-        v_sh_dc = None if v_shading is None and v_tints is None else torch.empty_like(sh_dc)
+        # What has no gradient passes none on.
+        v_log_scales = None if v_scales is None else torch.empty_like(scales)
+        v_logits = None if v_opacities is None else torch.empty_like(opacities)
+        v_correctives = None if v_means is None else torch.empty_like(correctives)
+        v_shading = torch.empty_like(shading) if v_colors is not None and shading.shape[1] else None
+        v_tints = None if v_colors is None or tints is None else torch.empty_like(tints)
+        v_sh_dc = None if v_colors is None else torch.empty_like(sh_dc)
         inputs = scales, opacities, sh_dc, correctives, shading, tints, ctx.kind
         turns = quats, quats_t, own, int(own is not None)
         v_finished = v_means, v_scales, v_opacities, v_colors

@@ -29,7 +29,7 @@ FLOAT_BYTES = 4
 BFLOAT16_PARTS = 3
 """Number of bfloat16 numbers whose sum stands for a float32 number."""
 LARGEST_TILED_BLOCK = 512
-"""Largest number of rows that a thread takes through all layers by tiles at once; its scratch stays in the cache."""
+"""Largest number of rows that a thread takes through all layers by tiles at once."""
 PARTS = 2
 """Number of tasks that share a panel of a layer's weight gradients."""
 
@@ -77,15 +77,16 @@ def _layout(shapes: tuple[tuple[int, int], ...], inputs: int, inputs_adjoint: bo
 
 
 class Layers:
-    """Weights of all layers, packed in the kernels' layout; valid until a parameter changes.
+    """Weights of all layers, packed in the kernels' layout where they are needed so; valid until a parameter changes.
 
     Args:
         weights: [out, in] of every layer, float32, contiguous, on the CPU; the first layer reads only the inputs.
         biases: [out] of every layer.
         inputs: number of input columns. A layer whose ``in`` exceeds its predecessor's ``out`` by this number reads the
             inputs again, before the predecessor's outputs (a skip connection).
-        inputs_adjoint: whether :meth:`gradients` will compute the gradient of the inputs.
-        bfloat16: whether :meth:`gradients` rounds its factors to bfloat16; not with ``inputs_adjoint``.
+        adjoint: whether :meth:`gradients` will be called; its weights are then those of now.
+        inputs_adjoint: whether it will compute the gradient of the inputs.
+        bfloat16: whether it rounds its factors to bfloat16; not with ``inputs_adjoint``.
     """
 
     def __init__(
@@ -93,6 +94,7 @@ class Layers:
         weights: list[Tensor],
         biases: list[Tensor],
         inputs: int,
+        adjoint: bool = False,
         inputs_adjoint: bool = False,
         bfloat16: bool = False,
     ) -> None:
@@ -112,7 +114,8 @@ class Layers:
         """Whether the values are computed by tiles, from the weights as they are."""
         if len(self.pairs):
             launch(kernels_pairs.pack_weight_pairs, *self._tasks(), self.table, self.pairs, grain=1)
-        self.packed = None if self.tiled else self._pack()
+        wanted = not self.tiled or (adjoint and not len(self.pairs))
+        self.packed = self._pack() if wanted else torch.empty(0)
 
     def _tasks(self) -> tuple[int, int]:
         """Return the number of panels of all matrices, each counted as the widest, and that of the widest."""
@@ -143,20 +146,18 @@ class Layers:
     def _values_in_parts(self, inputs: Tensor, hidden: Tensor, out: Tensor) -> None:
         """Write the outputs, and the hidden values if ``hidden`` has room for them."""
         rows, keep = inputs.shape[1], int(len(hidden) > 0)
-        # One block for each thread: a block cuts all weights into parts.
-        shared = -(-rows // (environment.thread_count() * NETWORK_BLOCK)) * NETWORK_BLOCK
+        # One block for each thread at a time: a block cuts all weights into parts, and its scratch stays in the cache.
+        slots = environment.thread_count()
+        shared = -(-rows // (slots * NETWORK_BLOCK)) * NETWORK_BLOCK
         size = max(min(shared, LARGEST_TILED_BLOCK), NETWORK_BLOCK)
-        blocks, room, pairs = -(-rows // size), -(-rows // NETWORK_BLOCK) * NETWORK_BLOCK, NETWORK_PANEL // 2
+        blocks, pairs = -(-rows // size), BFLOAT16_PARTS * NETWORK_PANEL // 2
         reads = len(inputs) + self.panels
-        shapes = (
-            (BFLOAT16_PARTS, len(inputs), room, pairs),
-            (2 * BFLOAT16_PARTS, self.panels, room, pairs),
-            (blocks, BFLOAT16_PARTS * reads * NETWORK_PANEL * pairs),
-        )
-        scratch = (torch.empty(shape, dtype=torch.int32) for shape in shapes)
-        launch(
-            kernels_parts.network_values_parts, blocks, size, keep, self.table, inputs, *scratch, hidden, out, grain=1
-        )  # fmt: skip
+        words = pairs * len(inputs) * size, 2 * pairs * self.panels * size, pairs * reads * NETWORK_PANEL
+        scratch = [torch.empty(min(slots, blocks), count, dtype=torch.int32) for count in words]
+        arguments = size, keep, self.table, inputs, *scratch, hidden, out
+        for begin in range(0, blocks, slots):
+            count = min(slots, blocks - begin)
+            launch(kernels_parts.network_values_parts, count, *arguments, grain=1, begin=begin)
 
     def gradients(
         self, inputs: Tensor, hidden: Tensor, v_out: Tensor, sizes: tuple[int, int, int] | None
@@ -184,11 +185,10 @@ class Layers:
     def _backward(self, table: Tensor, inputs: Tensor, hidden: Tensor, v_out: Tensor, v_inputs: Tensor | None) -> None:
         """Write the gradients of the parameters to the table's addresses, and those of the inputs to ``v_inputs``."""
         layers, rows, width = hidden.shape
-        packed = self._pack() if self.packed is None else self.packed
         v_hidden = torch.empty(layers, min(rows, ADJOINT_ROWS_AT_ONCE), width)
         for begin in range(0, rows, ADJOINT_ROWS_AT_ONCE):
             own = min(ADJOINT_ROWS_AT_ONCE, rows - begin)
-            grid, where = -(-own // NETWORK_BLOCK), (NETWORK_BLOCK, begin, table, packed)
+            grid, where = -(-own // NETWORK_BLOCK), (NETWORK_BLOCK, begin, table, self.packed)
             launch(kernels_adjoint.network_adjoint, grid, *where, hidden, v_out, v_hidden, grain=1)
             if v_inputs is not None:
                 launch(kernels_adjoint.network_inputs_adjoint, grid, *where, v_hidden, v_inputs, grain=1)
@@ -258,7 +258,8 @@ class _Network(torch.autograd.Function):
     def forward(ctx: Any, bfloat16, where, when, *parameters):
         half = len(parameters) // 2
         columns = where.shape[1] + when.shape[1]
-        layers = Layers(list(parameters[:half]), list(parameters[half:]), columns, ctx.needs_input_grad[1], bfloat16)
+        weights, biases = list(parameters[:half]), list(parameters[half:])
+        layers = Layers(weights, biases, columns, True, ctx.needs_input_grad[1], bfloat16)
         inputs, hidden, out = layers.values(where, when, keep=True)
         ctx.layers, ctx.sizes = layers, (where.shape[0], when.shape[0], where.shape[1])
         ctx.save_for_backward(inputs, hidden)

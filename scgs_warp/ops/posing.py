@@ -19,6 +19,10 @@ from .skinning import check_inputs, pack_palette, pose_tensors
 Form = Literal["auto", "plain", "cpu"]
 
 
+WIDTHS = {"translations": 3, "rotations": 4, "shape_rotations": 4, "log_scales": 3, "tints": 3}
+"""Number of columns of each field of a pose."""
+
+
 class _UnitPose(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, motion: Tensor, columns: tuple[int, ...]):
@@ -50,7 +54,16 @@ def unit_pose(motion: Tensor, heads: dict[str, int]) -> Pose:
 
     Returns:
         The pose, with gradients to ``motion``. A quaternion of norm 0 becomes the identity, without a gradient.
+
+    Raises:
+        ValueError: the heads do not cover the columns, or one has not the width of its field.
     """
+    columns = sum(heads.values())
+    if motion.ndim != 2 or motion.shape[1] != columns:
+        raise ValueError(f"motion must be [M, {columns}], got {tuple(motion.shape)}")
+    for name, width in heads.items():
+        if WIDTHS.get(name) != width:
+            raise ValueError(f"heads: {name} has {width} columns; the fields of a pose have {WIDTHS}")
     starts, at = {}, 0
     for name, width in heads.items():
         starts[name], at = at, at + width

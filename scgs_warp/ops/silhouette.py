@@ -80,7 +80,7 @@ def silhouette(
         Scalar. Gradients flow to ``means`` only.
 
     Raises:
-        ValueError: a shape is wrong, or there are no centres, pixels or distances.
+        ValueError: a shape or the form is wrong, or there are no centres, pixels or distances.
     """
     given = {
         "means": (means, ("N", 3)),
@@ -94,6 +94,8 @@ def silhouette(
         found = tuple(value.shape)
         if len(found) != len(shape) or any(n != m if isinstance(m, int) else n == 0 for n, m in zip(found, shape)):
             raise ValueError(f"{name} must be [{', '.join(map(str, shape))}], not empty, got {found}")
+    if form not in ("auto", "plain", "cpu") or (form == "cpu" and means.device.type != "cpu"):
+        raise ValueError(f"form must be auto, plain or, on a CPU, cpu, got {form!r} on {means.device}")
     if form == "auto":
         form = "cpu" if means.device.type == "cpu" else "plain"
     seen = camera.viewmat.detach().contiguous()[None], camera.K.detach().contiguous()[None], camera.width

@@ -21,7 +21,7 @@ THREAD = 32 << 20
 KERNEL = 2 << 20
 """Free bytes that loading a compiled kernel needs."""
 STACK_LEVELS = 300
-"""Depth of calls through C that takes about 600 KiB of stack; a training step takes 300 KiB."""
+"""Depth of calls through C that takes about 600 KiB of stack; a training step takes up to 400 KiB."""
 
 
 def limit() -> int | None:

@@ -170,8 +170,9 @@ def test_one_output_alone_has_the_gradients_of_its_parts(used):
     found, expected = (results(finish, inputs, weights) for finish in (ops.finish, in_parts))
     for name, value in found.items():
         other = expected[name]
-        if value is not None:
-            assert torch.equal(value, torch.zeros_like(value) if other is None else other), name
+        assert (value is None) == (other is None), name
+        if value is not None and other is not None:
+            assert torch.equal(value, other), name
 
 
 @pytest.mark.parametrize("extras", EXTRAS)
@@ -208,6 +209,12 @@ def test_what_asks_for_no_gradient_gets_none():
     inputs["tints"].requires_grad_()
     with torch.no_grad():
         assert not any(x.requires_grad for x in ops.finish(*arguments(inputs))[1:])
+
+
+@pytest.mark.parametrize("form", ["cuda", "CPU", ""])
+def test_an_unknown_form_is_refused(form):
+    with pytest.raises(ValueError, match="form must be"):
+        ops.finish(*arguments(draw(5)), form=form)
 
 
 def test_a_cpu_takes_one_node():

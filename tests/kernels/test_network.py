@@ -162,6 +162,23 @@ def test_weights_are_packed_only_as_the_kernels_need_them(products, monkeypatch)
     assert launched.count("pack_weights") == 1 + 2 * int(products == 1)
 
 
+@pytest.mark.parametrize("of_inputs", [False, True])
+@pytest.mark.parametrize("bfloat16", [False, True])
+def test_gradients_are_those_of_the_weights_that_gave_the_values(bfloat16, of_inputs, products):
+    gradients = []
+    for changed in (False, True):
+        weights, biases = parameters(SHAPES[1], 26)
+        where, when = rows(SHAPES[1], 9, 1, 26)
+        where.requires_grad_(of_inputs)
+        out = network(where, when, weights, biases, bfloat16=bfloat16)
+        if changed:
+            for weight in weights:
+                weight.data.mul_(-2.0)
+        wanted = (where, *weights, *biases) if of_inputs else (*weights, *biases)
+        gradients.append(torch.autograd.grad(out.sum(), wanted))
+    assert all(torch.equal(a, b) for a, b in zip(*gradients, strict=True))
+
+
 class Kernel:
     """A system that lets every program use tiles."""
 

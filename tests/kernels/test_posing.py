@@ -75,6 +75,17 @@ def test_a_rotation_that_vanishes_is_the_identity(device):
     assert unit_pose(motion, HEADS["control points"]).rotations.tolist() == [[1.0, 0.0, 0.0, 0.0]] * 2
 
 
+@pytest.mark.parametrize("columns, heads", [
+    (4, {"rotations": 4, "translations": 3}),
+    (12, {"rotations": 4, "translations": 3}),
+    (8, {"rotations": 4, "translations": 4}),
+    (9, {"rotations": 4, "translations": 3, "colors": 2}),
+])  # fmt: skip
+def test_output_of_other_heads_is_refused(columns, heads, device):
+    with pytest.raises(ValueError, match=r"motion must be|heads: "):
+        unit_pose(torch.zeros(3, columns, device=device), heads)
+
+
 def rest_of(count: int, corrected: bool, shaded: bool) -> list[torch.Tensor]:
     g = torch.Generator().manual_seed(5)
     widths = (3, 4, 3, 1, 3, 27 * corrected, 10 * shaded)

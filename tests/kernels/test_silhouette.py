@@ -244,6 +244,13 @@ def test_wrong_shapes_are_named(which, shape):
         ops.silhouette(values["means"], camera, values["distances"], values["size"], values["pixels"])
 
 
+@pytest.mark.parametrize("form", ["cuda", "CPU", ""])
+def test_an_unknown_form_is_refused(form):
+    camera = oblique()
+    with pytest.raises(ValueError, match="form must be"):
+        run(functools.partial(ops.silhouette, form=form), camera, draw(9, 5, 4, camera))
+
+
 def test_forms_agree_in_every_bit_of_the_gradients():
     """Both round each operation by itself; the values are the same sums. Extreme centres are among them."""
     camera = oblique()
