@@ -129,6 +129,65 @@ def _adjoint_pixels(
     launch.launch(kernels.photometric_adjoint, count, image, truth, mask, masked, blurred, v_sums, v_image)
 
 
+Scores = tuple[tuple[Tensor, Tensor, Tensor], Any, Any]
+"""Loss, L1 and SSIM; the number of values that count, and their mean squared error."""
+
+
+def _scores_on_host(sums: Tensor, image: Tensor, mask: Tensor | None, ssim_weight: float, log_weight: float) -> Scores:
+    """Combine the sums over rows [3, C, H], the few numbers in Python: torch takes longer for them."""
+    totals = sums.flatten(1).double().sum(1).tolist()  # a few thousand values: one thread, one order
+    valid = image.numel() if mask is None else int(mask.sum()) * image.shape[0]
+    count = float(max(valid, 1))
+    l1, similarity, error = (total / count for total in totals)
+    similarity = similarity if valid else 1.0
+    loss = (1.0 - ssim_weight) * l1 + ssim_weight * (1.0 - similarity)
+    if log_weight:
+        loss += log_weight * math.log(LEAST_ERROR if error < LEAST_ERROR else error)  # NaN is kept
+    return (image.new_tensor(loss), image.new_tensor(l1), image.new_tensor(similarity)), count, error
+
+
+def _scores_on_device(
+    sums: Tensor, image: Tensor, mask: Tensor | None, ssim_weight: float, log_weight: float
+) -> Scores:
+    """Combine the sums over rows [3, C, H] without waiting for the device."""
+    totals = sums.flatten(1).double().sum(1)
+    count: Any = float(max(image.numel(), 1))
+    if mask is not None:
+        count = mask.sum().double() * image.shape[0]
+        totals = torch.stack([totals[0], torch.where(count > 0, totals[1], 1.0), totals[2]])
+        count = count.clamp(min=1.0)
+    elif image.numel() == 0:
+        totals[1] = 1.0
+    l1, similarity, error = (totals / count).unbind()
+    loss = (1.0 - ssim_weight) * l1 + ssim_weight * (1.0 - similarity)
+    if log_weight:
+        loss = loss + log_weight * error.clamp(min=LEAST_ERROR).log()
+    return (loss.float(), l1.float(), similarity.float()), count, error
+
+
+Gradients = tuple[Tensor | None, ...]
+"""Of loss, L1 and SSIM."""
+
+
+def _slopes_on_host(
+    image: Tensor, gradients: Gradients, count: float, error: float, ssim_weight: float, log_weight: float
+) -> Tensor:
+    """Return the gradients [3] of the sums of L1, of SSIM and of squared errors."""
+    v_loss, v_l1, v_ssim = (0.0 if v is None else float(v) for v in gradients)
+    v_error = log_weight / error * v_loss if error > LEAST_ERROR else 0.0
+    v_means = v_l1 + (1.0 - ssim_weight) * v_loss, v_ssim - ssim_weight * v_loss, v_error
+    return image.new_tensor([v / count for v in v_means])
+
+
+def _slopes_on_device(
+    image: Tensor, gradients: Gradients, count: Any, error: Tensor, ssim_weight: float, log_weight: float
+) -> Tensor:
+    v_loss, v_l1, v_ssim = (torch.zeros_like(error) if v is None else v for v in gradients)
+    v_error = torch.where(error > LEAST_ERROR, log_weight / error, 0.0) * v_loss
+    v_means = torch.stack([v_l1 + (1.0 - ssim_weight) * v_loss, v_ssim - ssim_weight * v_loss, v_error])
+    return (v_means / count).float()
+
+
 class _Photometric(torch.autograd.Function):
     @staticmethod
     def forward(
@@ -147,31 +206,21 @@ class _Photometric(torch.autograd.Function):
             sums = image.new_zeros(3, 1, 1)
         else:
             sums = (_forward_bands if simd else _forward_pixels)(image, truth, mask, partials)
-        # A few thousand values in one order. The rest are single numbers, which torch handles more slowly than Python.
-        totals = sums.flatten(1).double().sum(1).tolist()
-        count = float(image.numel() if mask is None else int(mask.sum()) * image.shape[0])
-        l1, similarity, error = (total / max(count, 1.0) for total in totals)
-        if count == 0.0:
-            similarity = 1.0
-        loss = (1.0 - weights[0]) * l1 + weights[0] * (1.0 - similarity)
-        if weights[1]:
-            loss += weights[1] * math.log(LEAST_ERROR if error < LEAST_ERROR else error)  # NaN is kept
+        scores = _scores_on_device if image.is_cuda else _scores_on_host
+        results, ctx.count, ctx.error = scores(sums, image, mask, *weights)
         ctx.save_for_backward(image, truth, mask, partials)
-        ctx.weights, ctx.simd, ctx.count, ctx.error = weights, simd, max(count, 1.0), error
+        ctx.weights, ctx.simd = weights, simd
         ctx.set_materialize_grads(False)
-        return image.new_tensor(loss), image.new_tensor(l1), image.new_tensor(similarity)
+        return results
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *gradients: Tensor | None) -> tuple[Tensor | None, ...]:
         image, truth, mask, partials = ctx.saved_tensors
-        v_loss, v_l1, v_ssim = (0.0 if v is None else float(v) for v in gradients)
-        ssim_weight, log_weight = ctx.weights
         v_image = torch.empty_like(image)
         if image.numel():
-            v_error = log_weight / ctx.error * v_loss if ctx.error > LEAST_ERROR else 0.0
-            v_means = v_l1 + (1.0 - ssim_weight) * v_loss, v_ssim - ssim_weight * v_loss, v_error
-            v_sums = image.new_tensor([v / ctx.count for v in v_means])
+            slopes = _slopes_on_device if image.is_cuda else _slopes_on_host
+            v_sums = slopes(image, gradients, ctx.count, ctx.error, *ctx.weights)
             if ctx.simd:
                 bands = image.shape[0] * -(-image.shape[1] // SSIM_BAND)
                 launch.launch(
