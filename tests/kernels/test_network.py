@@ -179,28 +179,6 @@ def test_gradients_are_those_of_the_weights_that_gave_the_values(bfloat16, of_in
     assert all(torch.equal(a, b) for a, b in zip(*gradients, strict=True))
 
 
-class Kernel:
-    """A system that lets every program use tiles."""
-
-    @staticmethod
-    def syscall(*arguments: int) -> int:
-        assert arguments == (158, 0x1023, 18)
-        return 0
-
-
-def test_tiles_need_linux_on_x86(monkeypatch):
-    monkeypatch.setattr(matrix_tiles.ctypes, "CDLL", lambda name: Kernel)
-    monkeypatch.setattr(matrix_tiles.sys, "platform", "linux")
-    monkeypatch.setattr(matrix_tiles.platform, "machine", lambda: "x86_64")
-    assert matrix_tiles.may_use_tiles.__wrapped__() is True
-    for name, value in (("platform", "darwin"), ("platform", "win32")):
-        monkeypatch.setattr(matrix_tiles.sys, name, value)
-        assert not matrix_tiles.may_use_tiles.__wrapped__()
-    monkeypatch.setattr(matrix_tiles.sys, "platform", "linux")
-    monkeypatch.setattr(matrix_tiles.platform, "machine", lambda: "aarch64")
-    assert not matrix_tiles.may_use_tiles.__wrapped__()
-
-
 def test_tiles_are_used_where_there_are_some(monkeypatch):
     """They add in another order than pairs: some bit differs."""
     found = torch.zeros(1, dtype=torch.int32)
@@ -216,22 +194,6 @@ def test_tiles_are_used_where_there_are_some(monkeypatch):
         out = network(where, when, weights, biases, bfloat16=True)
         gradients.append(torch.autograd.grad(out.square().sum(), (*weights, *biases)))
     assert any(not torch.equal(a, b) for a, b in zip(*gradients, strict=True))
-
-
-@pytest.mark.parametrize("refused", [-1, None])
-def test_tiles_need_permission(refused, monkeypatch):
-    class Library:
-        @staticmethod
-        def syscall(*arguments: int) -> int:
-            assert arguments == (158, 0x1023, 18)
-            if refused is None:
-                raise OSError
-            return refused
-
-    monkeypatch.setattr(matrix_tiles.sys, "platform", "linux")
-    monkeypatch.setattr(matrix_tiles.platform, "machine", lambda: "x86_64")
-    monkeypatch.setattr(matrix_tiles.ctypes, "CDLL", lambda name: Library)
-    assert not matrix_tiles.may_use_tiles.__wrapped__()
 
 
 @pytest.mark.parametrize("bad", [float("nan"), float("inf"), -float("inf")])
