@@ -30,7 +30,7 @@ BFLOAT16_PARTS = 3
 """Number of bfloat16 numbers whose sum stands for a float32 number."""
 LARGEST_TILED_BLOCK = 512
 """Largest number of rows that a thread takes through all layers by tiles at once."""
-PARTS = 2
+TASKS_PER_PANEL = 2
 """Number of tasks that share a panel of a layer's weight gradients."""
 
 
@@ -192,8 +192,8 @@ class Layers:
             launch(kernels_adjoint.network_adjoint, grid, *where, hidden, v_out, v_hidden, grain=1)
             if v_inputs is not None:
                 launch(kernels_adjoint.network_inputs_adjoint, grid, *where, v_hidden, v_inputs, grain=1)
-            shared = self.panels, PARTS, begin, min(own, len(v_out) - begin), table, inputs, hidden, v_hidden
-            launch(kernels_adjoint.network_weights_adjoint, layers * self.panels * PARTS, *shared, grain=1)
+            shared = self.panels, TASKS_PER_PANEL, begin, min(own, len(v_out) - begin), table, inputs, hidden, v_hidden
+            launch(kernels_adjoint.network_weights_adjoint, layers * self.panels * TASKS_PER_PANEL, *shared, grain=1)
 
     def _backward_in_pairs(self, table: Tensor, inputs: Tensor, hidden: Tensor, v_out: Tensor) -> None:
         """Write the gradients of the parameters, from factors in bfloat16, to the table's addresses."""
@@ -214,8 +214,10 @@ class Layers:
             read = NETWORK_BLOCK, begin, tiles, table, self.pairs, inputs, hidden, v_out
             pairs = input_rows, hidden_rows, v_rows
             launch(kernels_pairs.network_adjoint_pairs, -(-own // NETWORK_BLOCK), *read, columns, *pairs, grain=1)
-            shared = self.panels, PARTS, begin, min(own, len(v_out) - begin), tiles, table, *pairs
-            launch(kernels_pairs.network_weights_adjoint_pairs, layers * self.panels * PARTS, *shared, grain=1)
+            shared = self.panels, TASKS_PER_PANEL, begin, min(own, len(v_out) - begin), tiles, table, *pairs
+            launch(
+                kernels_pairs.network_weights_adjoint_pairs, layers * self.panels * TASKS_PER_PANEL, *shared, grain=1
+            )
 
 
 def _over_times(v_inputs: Tensor, positions: int, times: int, columns: int) -> Tensor:
