@@ -311,6 +311,8 @@ class LossConfig:
     """Weight of the relative error of inverse depth where the data has depth maps (not in the paper)."""
     depth_until: float = newer(0.8, before=0.8, least=0, most=1)
     """Share of the main stage until which ``depth`` fades linearly."""
+    stereo: bool = newer(True, before=False)
+    """Compare depth by stereo where the data is of a rig without depth maps (not in the paper)."""
     frame_colors: float = newer(1e-3, before=1e-3, least=0, most=1e6)
     """Weight of the squared distance between a frame's affine colour (``optim.frame_colors``) and the identity."""
     frame_colors_smooth: float = newer(1e-3, before=1e-3, least=0, most=1e6)
@@ -362,13 +364,11 @@ class TrainConfig:
     seed: int = bounded(0, 0)
     """Random seed; the same seed gives bit-identical results on the same machine."""
     batch: int = bounded(1, 1, 100_000)
-    """Number of views per step; their gradients are averaged. Several processes can share the views
-    (docs/scaling.md)."""
+    """Number of views per step; their gradients are averaged. Processes can share them (docs/scaling.md)."""
     half_size: int = milestone(0)
     """Number of steps, over both stages, that use the images at half their size: coarse first, and twice as fast."""
     evaluate_every: int = milestone(5_000, 1)
-    """Number of steps between two evaluations on a few test images, for the curve only: they do not influence the
-    training."""
+    """Number of steps between two evaluations on a few test images, which only draw the curve."""
     checkpoint_seconds: float = bounded(60.0, 0)
     """Seconds between two checkpoints."""
     data: DataConfig = field(default_factory=DataConfig)

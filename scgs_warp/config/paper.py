@@ -147,6 +147,7 @@ PAPER = TrainConfig(
         flow_every=2,
         depth=0.0,
         depth_until=0.8,
+        stereo=False,
         frame_colors=1e-3,
         frame_colors_smooth=1e-3,
         hexplane_tv=1e-4,

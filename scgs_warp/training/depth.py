@@ -8,7 +8,7 @@ the wrong distance.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import cv2
 import numpy as np
@@ -52,6 +52,15 @@ class SeenDepth(NamedTuple):
     """[h, w] inverse of the depth along z, normalised; 0 where it is unknown."""
 
 
+class FrameDepths(Protocol):
+    """Depth of training frames, from depth maps or by stereo."""
+
+    @property
+    def available(self) -> bool: ...
+
+    def of(self, index: int) -> SeenDepth | None: ...
+
+
 class Depths:
     """Depth maps of the training frames."""
 
@@ -63,6 +72,11 @@ class Depths:
         """
         self._data, self._views, self._scale = data, views, scale
         self._kept: dict[int, SeenDepth] = {}
+
+    @property
+    def available(self) -> bool:
+        """True if frames have a depth map."""
+        return bool(self._data.with_depth)
 
     def read(self) -> None:
         """Read all maps once, so that a damaged one is found before training begins, and keep what fits.

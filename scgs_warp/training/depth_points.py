@@ -20,7 +20,7 @@ from ..runtime.progress import progress
 from ..runtime.search_tree import search_tree
 from ..seeding import generator
 from ..types import Camera
-from .depth import Depths, SeenDepth
+from .depth import Depths, FrameDepths, SeenDepth
 from .flow import Flows
 from .flow_points import LEAST_REGION, InstantPoints, colors_at, strays
 from .view_rays import pixels_of, ray_of
@@ -70,13 +70,13 @@ def depth_clouds(
         least = max(float(FEWEST), ENOUGH * max((each.count for each in found), default=0))
         kept = [each for each in found if each.count >= least]
         for one, two in itertools.pairwise(kept):
-            later.append(_later(one, two, flows, depths))
+            later.append(later_places(one, two.index, flows, depths))
             bar.advance()
         bar.advance(2 * len(chosen) - len(found) - len(later))
     return [each.cloud._replace(later=there) for each, there in zip(kept, [*later, None])]
 
 
-class _Seen(NamedTuple):
+class FramePoints(NamedTuple):
     """The moving points of a frame."""
 
     index: int
@@ -87,35 +87,35 @@ class _Seen(NamedTuple):
     cloud: InstantPoints
 
 
-def _cloud(index: int, count: int, data: Dataset, flows: Flows, depths: Depths, seed: int, key: int) -> _Seen:
+def _cloud(index: int, count: int, data: Dataset, flows: Flows, depths: Depths, seed: int, key: int) -> FramePoints:
     """Find the moving points of a frame, up to ``count`` of them, chosen at random."""
     seen = depths.of(index)
     assert seen is not None, "asked for frames with a depth map only"
     inverse = seen.inverse.numpy()
     rows, columns = np.nonzero(inverse > 0)
     pixels = np.stack([columns, rows], 1).astype(np.float64)
-    points = _placed(seen, pixels, inverse[rows, columns])
+    points = placed(seen, pixels, inverse[rows, columns])
     moves = _region(pixels, *_moves(index, points, pixels, flows), inverse)
     moves[moves] = ~strays(points[moves])
     every = moves.nonzero()[0]
     kept = every[torch.randperm(len(every), generator=generator(seed, key, index))[:count].numpy()]
     colors = colors_at(data[index].image, pixels[kept], (inverse.shape[1], inverse.shape[0]))
     found = torch.from_numpy(points[kept]).float(), colors, torch.ones(len(kept), dtype=torch.bool)
-    return _Seen(index, pixels[kept], len(every), InstantPoints(*found, data.entries[index].time))
+    return FramePoints(index, pixels[kept], len(every), InstantPoints(*found, data.entries[index].time))
 
 
-def _placed(seen: SeenDepth, pixels: np.ndarray, inverse: np.ndarray) -> np.ndarray:
+def placed(seen: SeenDepth, pixels: np.ndarray, inverse: np.ndarray) -> np.ndarray:
     """Return the points [P, 3] at pixels [P, 2] with inverse depths [P]."""
     start, directions = ray_of(seen.camera, pixels)
     along = directions @ seen.camera.viewmat[2, :3].double().numpy()
     return start + directions / (inverse * along)[:, None]
 
 
-def _later(one: _Seen, two: _Seen, flows: Flows, depths: Depths) -> Tensor:
+def later_places(one: FramePoints, following: int, flows: Flows, depths: FrameDepths) -> Tensor:
     """Return where the points of a frame are in a later one, [P, 3]: at the depth of the pixel to which flow leads; NaN
     where flow or depth is not known."""
     there = np.full((len(one.pixels), 3), np.nan)
-    path, seen = flows.between_frames(one.index, two.index), depths.of(two.index)
+    path, seen = flows.between_frames(one.index, following), depths.of(following)
     if path is None or seen is None:
         return torch.from_numpy(there).float()
     vectors, certain = flows.along(path)
@@ -125,7 +125,7 @@ def _later(one: _Seen, two: _Seen, flows: Flows, depths: Depths) -> Tensor:
     height, width = seen.inverse.shape
     inverse = seen.inverse.numpy()[y.clip(0, height - 1), x.clip(0, width - 1)]
     known = certain[rows, columns] & (inverse > 0) & (x >= 0) & (y >= 0) & (x < width) & (y < height)
-    there[known] = _placed(seen, targets[known], inverse[known])
+    there[known] = placed(seen, targets[known], inverse[known])
     return torch.from_numpy(there).float()
 
 

@@ -17,10 +17,11 @@ from ..geometry.normalisation import Normalisation
 from ..runtime.device_copies import sent
 from ..seeding import generator
 from ..types import Camera, Frame
-from .depth import Depths
+from .depth import Depths, FrameDepths
 from .device_images import DeviceImages
 from .flow import Flows
 from .silhouettes import Silhouette, Silhouettes
+from .stereo_depth import StereoDepths
 
 PROGRESSIVE_SHARE = 0.2
 """Share of the frames with which progressive pre-training begins and by which it grows."""
@@ -78,7 +79,18 @@ class Frames:
     """Training frames in random order without replacement: the order is the same for the same seed and differs between
     epochs."""
 
-    def __init__(self, data: Dataset, normalisation: Normalisation, config: TrainConfig, device: str) -> None:
+    def __init__(
+        self,
+        data: Dataset,
+        normalisation: Normalisation,
+        config: TrainConfig,
+        device: str,
+        stereo: StereoDepths | None = None,
+    ) -> None:
+        """
+        Args:
+            stereo: depth of frames without depth maps.
+        """
         self.frames = data
         self.config, self.device = config, torch.device(device)
         self.views = [normalisation.apply_camera(frame.camera) for frame in data.entries]
@@ -88,9 +100,10 @@ class Frames:
         self.random_background = data.background == "random"
         self.silhouettes = Silhouettes(device)
         self.flows = Flows(data, self.views)
-        self.depths = Depths(data, self.views, normalisation.scale)
-        if config.loss.depth > 0.0 and data.with_depth:
-            self.depths.read()
+        maps = Depths(data, self.views, normalisation.scale)
+        if config.loss.depth > 0.0 and maps.available:
+            maps.read()
+        self.depths: FrameDepths = stereo if stereo is not None and not maps.available else maps
         self._parts: dict[tuple[int, bool], Parts] = {}
         self._order: tuple[tuple[int, int], list[int]] = ((-1, 0), [])
         self.by_time = sorted(range(len(self.frames)), key=lambda i: data.entries[i].time)

@@ -96,7 +96,7 @@ def fit(
         # The first process may have to restore a checkpoint before the others read it.
         state = group.in_turn(open_state) if group is not None and resume else open_state()
         state.group = group
-        frames = Frames(data, state.normalisation, config, device)
+        frames = Frames(data, state.normalisation, config, device, state.compared_stereo(data))
         folder.start(state.step)
 
         # 3. Train.

@@ -12,11 +12,11 @@ from ..geometry.normalisation import FEWEST_POINTS, Normalisation
 from ..types import Camera
 from .depth import Depths
 from .depth_points import depth_clouds, on_movers
-from .flow import follow_each_other
+from .flow import Flows, follow_each_other
 from .flow_points import InstantPoints, flow_points
-from .standing_cameras import standing_cameras
 from .start_motion import SeenMotion, start_cloud
-from .stereo_points import Stereo, moving_points
+from .stereo_depth import StereoDepths, stereo_depths
+from .stereo_points import moving_points, stereo_clouds
 from .tracks import gather
 
 KEY = 36
@@ -36,6 +36,8 @@ class Movers(NamedTuple):
     replaced."""
     motion: SeenMotion | None = None
     """What stereo or depth maps show of the motion."""
+    stereo: StereoDepths | None = None
+    """Depth of the frames, if the cameras stand still."""
 
 
 def points_on_movers(
@@ -51,14 +53,13 @@ def points_on_movers(
     """
     views = [normalisation.apply_camera(camera) for camera in data.cameras]
     keep, found, motion = torch.ones(len(known), dtype=torch.bool), None, None
-    standing = standing_cameras(data, views)
-    if standing:
+    stereo = stereo_depths(data, normalisation)
+    if stereo is not None:
         most = min(most, int(SHARE * count))
-        clouds = Stereo(known, data, standing).clouds(most, seed, KEY)
-        if clouds:
-            found = start_cloud(clouds)
-            motion = SeenMotion(found, clouds, None)
-            keep = _kept(known, torch.from_numpy(~moving_points(known.double().numpy(), standing)))
+        clouds = stereo_clouds(stereo, Flows(data, views), most, seed, KEY)
+        found, motion = _gathered(clouds, most, seed)
+        if found is not None:
+            keep = _kept(known, torch.from_numpy(~moving_points(known.double().numpy(), stereo.standing)))
     elif (data.with_depth or len(known) < count) and follow_each_other(data):
         if data.with_depth:
             found, motion = _by_depth(min(most, int(SHARE * count)), data, views, normalisation.scale, seed)
@@ -67,7 +68,7 @@ def points_on_movers(
             found = flow_points(min(most, count - len(known)), known, data, views)
     if found is None:
         found = InstantPoints(torch.zeros(0, 3), torch.zeros(0, 3), torch.zeros(0, dtype=torch.bool), 0.0)
-    return Movers(found, keep, motion)
+    return Movers(found, keep, motion, stereo)
 
 
 def _kept(known: Tensor, rests: Tensor) -> Tensor:
@@ -82,6 +83,11 @@ def _by_depth(
     depths = Depths(data, views, scale)
     depths.read()
     clouds = depth_clouds(most, data, views, depths, seed, KEY)
+    return _gathered(clouds, most, seed)
+
+
+def _gathered(clouds: list[InstantPoints], most: int, seed: int) -> tuple[InstantPoints | None, SeenMotion | None]:
+    """Gather the points of all clouds in the rest pose, up to ``most``; None if nothing moves."""
     if not clouds:
         return None, None
     start = [cloud.time for cloud in clouds].index(start_cloud(clouds).time)

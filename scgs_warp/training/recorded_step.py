@@ -144,7 +144,7 @@ class RecordedSteps:
     def _compares_depth(self) -> bool:
         state = self._state
         applies = state.stage == "main" and depth_applies(state.stage_step, state.config)
-        return applies and bool(self._frames.frames.with_depth)
+        return applies and self._frames.depths.available
 
     def _make_room(self, pairs: int) -> bool:
         """Set the capacity for ``pairs``; return False if it exceeds the index range or the memory."""

@@ -29,6 +29,7 @@ from ..storage import checkpoint
 from ..types import Stats
 from .background_points import background_points
 from .camera_refinement import CameraRefinement
+from .depth import depth_applies
 from .exposure import Exposure
 from .flow import follow_each_other
 from .frames import first_frames
@@ -48,6 +49,7 @@ from .resuming import check_same_configuration, check_steps
 from .second_config import may_be_tried_again
 from .silhouettes import half_thickness, is_in_parts, is_thin
 from .start_motion import SeenMotion, learn_motion
+from .stereo_depth import StereoDepths, stereo_depths
 
 Stage = Literal["pretrain", "main"]
 THICKEST = 2.0
@@ -102,6 +104,8 @@ class TrainState:
         self.failures = 0
         self.group: ProcessGroup | None = None
         """Processes that share each step's views; not part of a checkpoint."""
+        self.stereo: StereoDepths | None = None
+        """Depth of the frames of a rig, if it has been found; not part of a checkpoint."""
         self.consistent = True
         """False between an update of the parameters and the increment of ``step``; such a state must not be saved."""
         self.cameras = CameraRefinement(frames if config.optim.cameras > 0 else 0).to(gaussians.means.device)
@@ -138,7 +142,9 @@ class TrainState:
         motion = initial_motion(config, shown, len(data.times.unique()), moves).to(device)
         if isinstance(motion, ControlPoints) and initial.motion is not None and len(initial.motion.clouds) > 1:
             learn_motion(motion, initial.motion, shown[~moves].cpu(), config)
-        return TrainState(config, gaussians, motion, *rest, stage="main", **identity)
+        state = TrainState(config, gaussians, motion, *rest, stage="main", **identity)
+        state.stereo = initial.stereo
+        return state
 
     def begin_main(self) -> None:
         """Enter stage 2: spheres become control points, and Gaussians are made."""
@@ -163,6 +169,17 @@ class TrainState:
     @property
     def stage_step(self) -> int:
         return self.step if self.stage == "pretrain" else self.step - self.config.pretrain_steps
+
+    def compared_stereo(self, data: Dataset) -> StereoDepths | None:
+        """Return the depth by stereo that steps to come compare (``loss.stereo``); None if none do. It is found again
+        after a checkpoint."""
+        config, still = self.config, self.config.motion.model == "static"
+        if still or not config.loss.stereo or not depth_applies(self.stage_step, config):
+            return None
+        if data.with_alpha or data.with_depth or not has_initial_points(data, config):
+            return None
+        self.stereo = self.stereo or stereo_depths(data, self.normalisation)
+        return self.stereo
 
     @property
     def refines_cameras(self) -> bool:
@@ -340,6 +357,8 @@ class InitialPoints(NamedTuple):
     """[Q] bool for the leading Q points, which lie on what is seen: True if known to move."""
     motion: SeenMotion | None = None
     """What is seen of the motion."""
+    stereo: StereoDepths | None = None
+    """Depth of the frames of a rig."""
 
 
 def _initial_points(config: TrainConfig, data: Dataset, normalisation: Normalisation) -> InitialPoints:
@@ -364,12 +383,14 @@ def _initial_points(config: TrainConfig, data: Dataset, normalisation: Normalisa
     moves = torch.zeros(len(points), dtype=torch.bool)
     if cube or data.with_alpha:  # with alpha, no background lies behind the points
         return InitialPoints(points, colors, moves)
-    known, motion = points, None
+    known, motion, stereo = points, None, None
     if config.flow_points and config.motion.model != "static":
         used = min(config.init_points, config.densify.max_gaussians)
-        seen, keep, motion = points_on_movers(config.flow_points, used, points, data, normalisation, config.seed)
+        seen, keep, motion, stereo = points_on_movers(
+            config.flow_points, used, points, data, normalisation, config.seed
+        )
         known, room = points[keep], used - len(seen.points)
         points, colors = torch.cat([known[:room], seen.points]), torch.cat([colors[keep][:room], seen.colors])
         moves = torch.cat([moves[keep][:room], seen.moves])
     behind = background_points(count - len(points), known, data, normalisation, config.seed, 35)
-    return InitialPoints(torch.cat([points, behind[0]]), torch.cat([colors, behind[1]]), moves, motion)
+    return InitialPoints(torch.cat([points, behind[0]]), torch.cat([colors, behind[1]]), moves, motion, stereo)

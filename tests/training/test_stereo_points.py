@@ -10,33 +10,18 @@ import pytest
 import torch
 
 from helpers.ball_and_wall import SIZE, ball, filmed, standing_camera, walking_camera, wall
+from helpers.ball_rig import ANGLES, MOMENTS, place_at, rig_views, standing_in, stereo_of
 from helpers.tiny import tiny_config
 from scgs_warp.data.dataset import Dataset
 from scgs_warp.geometry.normalisation import Normalisation
+from scgs_warp.training.flow import Flows
 from scgs_warp.training.points_on_movers import points_on_movers
-from scgs_warp.training.standing_cameras import levels, standing_cameras
+from scgs_warp.training.standing_cameras import levels
 from scgs_warp.training.start_motion import start_cloud
 from scgs_warp.training.state import TrainState
 from scgs_warp.training.stereo import StereoPair
-from scgs_warp.training.stereo_points import Stereo, moving_points
+from scgs_warp.training.stereo_points import moving_points, stereo_clouds
 from scgs_warp.types import Camera
-
-ANGLES = (-20.0, -10.0, 0.0, 10.0, 20.0)
-HEIGHTS = (0.3, 0.8, 0.3, 0.8, 0.3)
-MOMENTS = 7
-
-
-def place_at(time: float) -> torch.Tensor:
-    """The ball crosses from left to right in a low arc."""
-    return torch.tensor([1.2 * time - 0.6, 0.0, 0.3 * time * (1 - time)])
-
-
-def rig_views(angles=ANGLES, heights=HEIGHTS, moments: int = MOMENTS) -> list[tuple[Camera, float]]:
-    return [
-        (standing_camera(angle, height), moment / (moments - 1))
-        for angle, height in zip(angles, heights)
-        for moment in range(moments)
-    ]
 
 
 @pytest.fixture(scope="module")
@@ -44,16 +29,15 @@ def film() -> Dataset:
     return filmed(rig_views(), place_at)
 
 
-def standing_in(film: Dataset):
-    normalisation = Normalisation.fit(film.cameras, film.points)
+def clouds_in(film: Dataset, count: int = 300):
+    normalisation, stereo = stereo_of(film)
     views = [normalisation.apply_camera(camera) for camera in film.cameras]
-    return normalisation, standing_cameras(film, views)
+    return normalisation, stereo_clouds(stereo, Flows(film, views), count, 0, 1)
 
 
 def found_in(film: Dataset, count: int = 800, time: float = 0.5):
-    normalisation, standing = standing_in(film)
-    stereo = Stereo(normalisation.apply(film.points).float(), film, standing)
-    found = stereo.points_at(time, count, 0, 1)
+    normalisation, clouds = clouds_in(film, count)
+    found = next(cloud for cloud in clouds if cloud.time == time)
     return found, found.points.double() / normalisation.scale + torch.as_tensor(normalisation.centre)
 
 
@@ -228,8 +212,7 @@ def test_threads_of_opencv_do_not_change_the_points(film):
 
 
 def test_clouds_follow_the_ball(film):
-    normalisation, standing = standing_in(film)
-    clouds = Stereo(normalisation.apply(film.points).float(), film, standing).clouds(300, 0, 1)
+    normalisation, clouds = clouds_in(film)
     assert [cloud.time for cloud in clouds] == [moment / (MOMENTS - 1) for moment in range(MOMENTS)]
     for cloud in clouds:
         places = cloud.points.double() / normalisation.scale + torch.as_tensor(normalisation.centre)
@@ -241,21 +224,19 @@ def test_clouds_follow_the_ball(film):
 def test_moments_without_enough_points_are_left_out():
     away = torch.tensor([0.0, 0.0, 50.0])
     late = filmed(rig_views(moments=9), lambda time: place_at(time) if time > 0.6 else away)
-    normalisation, standing = standing_in(late)
-    clouds = Stereo(normalisation.apply(late.points).float(), late, standing).clouds(300, 0, 1)
-    assert [cloud.time for cloud in clouds] == [0.625, 0.75, 0.875, 1.0]
+    assert [cloud.time for cloud in clouds_in(late)[1]] == [0.625, 0.75, 0.875, 1.0]
 
 
 def test_where_nothing_moves_there_are_none():
     still = filmed(rig_views(), None)
-    normalisation, standing = standing_in(still)
-    assert Stereo(normalisation.apply(still.points).float(), still, standing).clouds(100, 0, 1) == []
+    assert clouds_in(still)[1] == []
 
 
 def test_cameras_too_far_apart_are_not_paired():
     film = filmed(rig_views((-60.0, 0.0, 60.0), (0.3, 0.3, 0.3)), place_at)
-    normalisation, standing = standing_in(film)
-    assert len(standing) == 3 and Stereo(normalisation.apply(film.points).float(), film, standing).pairs == {}
+    stereo = stereo_of(film)[1]
+    assert len(stereo.standing) == 3 and stereo.pairs == {} and not stereo.available
+    assert stereo.of(0) is None and clouds_in(film)[1] == []
 
 
 def test_a_point_on_the_wall_behind_the_ball_does_not_move(film):
@@ -285,9 +266,9 @@ def test_sparse_points_on_the_ball_are_replaced(film):
     data = Dataset(tuple(film), folder=film.folder, split="train", points=points, colors=torch.full_like(points, 0.5))
     normalisation = Normalisation.fit(data.cameras, data.points)
     known = normalisation.apply(points).float()
-    seen, keep, motion = points_on_movers(300, 1000, known, data, normalisation, 0)
+    seen, keep, motion, _ = points_on_movers(300, 1000, known, data, normalisation, 0)
     assert len(seen.points) == 300 and bool(seen.moves.all())
-    assert motion is not None and motion.tracks is None and len(motion.clouds) == MOMENTS
+    assert motion is not None and motion.tracks is not None and len(motion.clouds) == MOMENTS
     assert keep[len(film.points) :].float().mean() < 0.2 and keep[: len(film.points)].float().mean() > 0.85
 
 
@@ -302,7 +283,7 @@ def test_a_start_without_room_keeps_half_for_the_ball(film):
 def test_sparse_points_stay_if_all_lie_where_something_moves(film):
     points = ball(place_at(0.5)).means[::40]
     normalisation = Normalisation.fit(film.cameras, points)
-    seen, keep, _ = points_on_movers(300, 1000, normalisation.apply(points).float(), film, normalisation, 0)
+    seen, keep, _, _ = points_on_movers(300, 1000, normalisation.apply(points).float(), film, normalisation, 0)
     assert bool(keep.all()) and len(seen.points) > 0
 
 
