@@ -173,12 +173,12 @@ class TrainState:
     def compared_stereo(self, data: Dataset) -> StereoDepths | None:
         """Return the depth by stereo that steps to come compare (``loss.stereo``); None if none do. It is found again
         after a checkpoint."""
-        config, still = self.config, self.config.motion.model == "static"
-        if still or not config.loss.stereo or not depth_applies(self.stage_step, config):
-            return None
-        if data.with_alpha or data.with_depth or not has_initial_points(data, config):
-            return None
-        self.stereo = self.stereo or stereo_depths(data, self.normalisation)
+        config, step = self.config, 0 if self.stage == "pretrain" else self.stage_step
+        compares = config.loss.stereo and depth_applies(step, config) and config.motion.model != "static"
+        if not compares or data.with_alpha or data.with_depth or not has_initial_points(data, config):
+            self.stereo = None
+        elif self.stereo is None:
+            self.stereo = stereo_depths(data, self.normalisation)
         return self.stereo
 
     @property

@@ -31,6 +31,8 @@ NEARER, FARTHER = 0.5, 1.2
 """Factors on the depth of the nearest and the farthest known points in view, between which depth is sought."""
 FEWEST_KNOWN = 10
 """Least number of known points in view."""
+NO_END = 0.5
+"""Distance from the ends of the range of disparities, pixels: what is beyond it is matched there."""
 LEAST_SIDE = 16
 """Least width and height of a region that is matched, pixels."""
 
@@ -109,7 +111,12 @@ class StereoPair(NamedTuple):
             return np.zeros((0, 3)), np.zeros((0, 3), np.uint8)
         disparity = self._matcher().compute(one, two).astype(np.float64) / 16.0
         parallax = disparity - (self.offsets[0, 0] - self.offsets[1, 0])
-        found = (disparity >= 0.0) & (parallax > 1e-6) & (sought[top:bottom, left:right] > 0)
+        found = (
+            (disparity > NO_END)
+            & (disparity < self.disparities - 1 - NO_END)
+            & (parallax > 1e-6)
+            & (sought[top:bottom, left:right] > 0)
+        )
         rows, columns = np.nonzero(found)
         start, end = (camera.position.double().numpy() for camera in self.cameras)
         depth = self.focal * float(np.linalg.norm(end - start)) / parallax[rows, columns]

@@ -33,6 +33,8 @@ MOST_MOMENTS, MOST_MATCHES = 24, 160
 cameras, moments take turns with them, except the middle one, where Gaussians begin."""
 SPREAD = 0.02
 """Largest standard deviation of the logarithm of the depths within a pixel."""
+APART = 0.9
+"""Least time between two moments, as a share of the time between frames: at less, some cameras show the same frame."""
 BORDER = 1.0
 """Width of the border of the second picture in which no match counts, pixels: nothing is beyond it."""
 
@@ -51,8 +53,10 @@ class StereoDepths:
         """By the cameras' numbers."""
         self._camera_of = {index: number for number, one in enumerate(standing) for index in one.frames}
         self._kept: dict[int, SeenDepth] = {}
+        """Those of the matched moments, and of other frames as far as they fit."""
         self._bytes = 0
-        every = sorted({data.entries[index].time for one in standing for index in one.frames})
+        """Of those other frames."""
+        every = self._instants()
         self.moments = [every[index] for index in spread(len(every), MOST_MOMENTS)] if self.pairs else []
         turns = math.ceil(len(self.pairs) * len(self.moments) / MOST_MATCHES)
         middle = min(self.moments, key=lambda time: abs(time - 0.5), default=0.0)
@@ -81,7 +85,11 @@ class StereoDepths:
         except UserError as error:
             raise FrameError(str(error)) from error
         number = self._camera_of[index]
-        return self._keep(index, frame, np.where(self._changed(number, frame), np.float32(0.0), self._still[number]))
+        seen = self._seen(number, frame, np.where(self._changed(number, frame), np.float32(0.0), self._still[number]))
+        if self._bytes + seen.inverse.nbytes <= KEPT_MIB * 2**20:
+            self._kept[index] = seen
+            self._bytes += seen.inverse.nbytes
+        return seen
 
     def size(self, number: int) -> tuple[int, int]:
         """Return width and height of the depth of a camera's frames."""
@@ -93,6 +101,15 @@ class StereoDepths:
         then are left out."""
         at = {number: one.frame_at(time, self.data) for number, one in enumerate(self.standing)}
         return {number: index for number, index in at.items() if index is not None}
+
+    def _instants(self) -> list[float]:
+        """Return times at which cameras have frames. Those of cameras that are not locked count as one instant if they
+        are close."""
+        least, instants = APART * float(np.median([one.spacing for one in self.standing])), []
+        for time in sorted({self.data.entries[index].time for one in self.standing for index in one.frames}):
+            if not instants or time - instants[-1] >= least:
+                instants.append(time)
+        return instants
 
     def _of_medians(self) -> list[np.ndarray]:
         """Match what stands still: the depth [h, w] of each camera, 0 where unknown."""
@@ -114,9 +131,10 @@ class StereoDepths:
         }
         points = self._points([pair for pair in pairs if {*pair} <= {*frames}], pictures, changed)
         for number, index in self.frames_at(time).items():
-            depth = self._fused(number, points[number])
-            depth = np.where(self._changed(number, frames[number]), depth, self._still[number])
-            self._keep(index, frames[number], depth)
+            if points[number]:
+                depth = self._fused(number, points[number])
+                depth = np.where(self._changed(number, frames[number]), depth, self._still[number])
+                self._kept[index] = self._seen(number, frames[number], depth)
 
     def _points(
         self, pairs: list[tuple[int, int]], pictures: dict[int, np.ndarray], regions: dict[int, np.ndarray]
@@ -152,16 +170,12 @@ class StereoDepths:
         changed = self.standing[number].changed(frame).astype(np.uint8)
         return cv2.resize(changed, self.size(number), interpolation=cv2.INTER_NEAREST) > 0
 
-    def _keep(self, index: int, frame: Frame, depth: np.ndarray) -> SeenDepth:
-        """Make a frame's depth of a map [h, w], without masked pixels, and keep it if it fits."""
+    def _seen(self, number: int, frame: Frame, depth: np.ndarray) -> SeenDepth:
+        """Make the depth of a camera's frame of a map [h, w], without masked pixels."""
         if frame.mask is not None:
-            shown = cv2.resize(frame.mask.numpy().astype(np.uint8), depth.shape[::-1], interpolation=cv2.INTER_NEAREST)
-            depth = depth * shown
-        seen = seen_depth(depth, self.standing[self._camera_of[index]].camera)
-        if self._bytes + seen.inverse.nbytes <= KEPT_MIB * 2**20:
-            self._kept[index] = seen
-            self._bytes += seen.inverse.nbytes
-        return seen
+            shown = cv2.resize(frame.mask.numpy().astype(np.float32), depth.shape[::-1], interpolation=cv2.INTER_AREA)
+            depth = depth * (shown > 1.0 - 1e-4)
+        return seen_depth(depth, self.standing[number].camera)
 
 
 def stereo_depths(data: Dataset, normalisation: Normalisation) -> StereoDepths | None:

@@ -84,8 +84,9 @@ def _moment(time: float, stereo: StereoDepths, count: int, seed: int, key: int) 
         rows, columns = np.nonzero(inverse > 0)
         at = np.stack([columns, rows], 1).astype(np.float64)
         places = placed(seen, at, inverse[rows, columns])
+        moves = one.sees(places, region)[1]
         # What stands still behind a mover's path looks as usual.
-        moves = one.sees(places, region)[1] & moving_points(places, views, changed)
+        moves[moves] = moving_points(places[moves], views, changed)
         pixels.append(at[moves])
         points.append(places[moves])
         frames.append(np.full(int(moves.sum()), index))
@@ -112,6 +113,6 @@ def _joined(moment: dict[int, FramePoints], time: float) -> InstantPoints:
 
 def _later(one: FramePoints, two: FramePoints | None, flows: Flows, stereo: StereoDepths) -> torch.Tensor:
     """Return where the points of a frame are in its camera's frame of the next moment, [P, 3]; NaN where unknown."""
-    if two is None or two.index == one.index:
+    if two is None or two.index == one.index or not len(one.pixels):
         return torch.full_like(one.cloud.points, torch.nan)
     return later_places(one, two.index, flows, stereo)

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 import torch
 
-from helpers.ball_and_wall import SIZE, filmed
-from helpers.ball_rig import ANGLES, MOMENTS, place_at, rig_views, stereo_of
+from helpers.ball_and_wall import SIZE, filmed, standing_camera
+from helpers.ball_rig import ANGLES, HEIGHTS, MOMENTS, place_at, rig_views, stereo_of
 from helpers.steps import check_same_bits
 from helpers.tiny import tiny_config
 from scgs_warp.data.dataset import Dataset
@@ -77,6 +77,30 @@ def test_maps_that_are_not_kept_are_made_again_with_the_same_bits(film, stereo, 
     between = next(index for index in range(len(film)) if film.entries[index].time not in kept.moments)
     first = kept.of(between).inverse
     assert kept.of(between).inverse is not first and torch.equal(kept.of(between).inverse, first)
+
+
+def test_cameras_that_are_not_locked_share_their_instants():
+    """Frames up to 0.45 of a frame apart are of one moment: no camera shows one frame at two of them."""
+    spacing = 1.0 / (MOMENTS - 1)
+    late = dict(zip(ANGLES, (0.0, 0.4, -0.4, 0.2, -0.3)))
+    views = [
+        (standing_camera(angle, height), min(max((moment + late[angle]) * spacing, 0.0), 1.0))
+        for angle, height in zip(ANGLES, HEIGHTS)
+        for moment in range(MOMENTS)
+    ]
+    _, depths = stereo_of(filmed(views, place_at))
+    assert MOMENTS - 1 <= len(depths.moments) <= MOMENTS + 1
+    for number in range(len(ANGLES)):
+        shown = [depths.frames_at(time)[number] for time in depths.moments if number in depths.frames_at(time)]
+        assert len(shown) >= MOMENTS - 2 and len(set(shown)) >= len(shown) - 1
+
+
+def test_matched_depth_is_kept_whatever_its_size(film, monkeypatch):
+    monkeypatch.setattr(stereo_depth, "KEPT_MIB", 0)
+    normalisation, depths = stereo_of(film)
+    for index in range(0, len(film), 5):
+        _, _, ball = surfaces(film, normalisation, depths, index)
+        assert (ball < NEAR_BALL).mean() > 0.01
 
 
 @pytest.mark.parametrize(("most", "all_pairs"), [(1000, True), (14, False)])
@@ -154,6 +178,13 @@ def test_there_is_no_stereo_where_nothing_would_be_compared(film, lack):
     elif lack == "late":
         state.step = state.config.steps - 1
     assert state.compared_stereo(data) is None
+
+
+def test_stage_1_of_a_resumed_run_still_has_the_depth_of_stage_2(film):
+    """Its own step is beyond the share of the main stage in which depth is compared."""
+    state = TrainState.begin(config(pretrain={"with_points": True, "steps": 36, "warm_up": 4}), film, "cpu")
+    state.step = 34
+    assert state.stage == "pretrain" and state.compared_stereo(film) is not None
 
 
 def test_without_points_on_movers_depth_is_found_for_the_loss(film):

@@ -23,8 +23,8 @@ FEW_INLIERS = (100, 50, 25)
 apart."""
 
 LENS_GAIN = 0.01
-"""Least share by which distortion must lower the root mean square of the reprojection errors. Few pictures of a scene,
-seen from all around it, hardly tell distortion from focal length: one that explains next to nothing bends the scene."""
+"""Least share by which distortion must lower the median reprojection error. A few pictures can hardly tell distortion
+from focal length, and a distortion that explains next to nothing bends the scene."""
 
 
 class RigCamera(NamedTuple):
@@ -89,24 +89,28 @@ def solve(database: Path, stills: FrameFiles, folder: Path, seed: int) -> int:
 
 def straightened(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
     """Return the model with lenses without distortion, adjusted anew, if it fits almost as well; else the model."""
-    import pycolmap
-
+    if not model.points3D:
+        return model
     straight = copy.deepcopy(model)
     for lens in straight.cameras.values():
         params = np.array(lens.params)
         params[lens.extra_params_idxs()] = 0.0
         lens.params = params
+    bent_misfit, straight_misfit = _misfit(copy.deepcopy(model), True), _misfit(straight, False)
+    return straight if straight_misfit * (1.0 - LENS_GAIN) <= bent_misfit else model
+
+
+def _misfit(model: pycolmap.Reconstruction, distortion: bool) -> float:
+    """Adjust a model in place, its distortion if asked; return the median over points of the mean reprojection error,
+    pixels. Strays would dominate a mean."""
+    import pycolmap
+
     options = pycolmap.BundleAdjustmentOptions()
-    options.refine_extra_params = options.print_summary = False
+    options.print_summary, options.refine_extra_params = False, distortion
     options.ceres.solver_options.num_threads = 1
-    pycolmap.bundle_adjustment(straight, options)
-    straight.update_point_3d_errors()
-    return straight if _misfit(straight) * (1.0 - LENS_GAIN) <= _misfit(model) else model
-
-
-def _misfit(model: pycolmap.Reconstruction) -> float:
-    """Return the root mean square over points of the mean reprojection error, pixels."""
-    return float(np.sqrt(np.mean(np.square([point.error for point in model.points3D.values()]))))
+    pycolmap.bundle_adjustment(model, options)
+    model.update_point_3d_errors()
+    return float(np.median([point.error for point in model.points3D.values()]))
 
 
 def read_solution(folder: Path, names: Sequence[str]) -> RigSolution | None:
