@@ -6,15 +6,12 @@ import copy
 import shutil
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from ..features import FrameFiles, quiet
 from ..mapping import MAX_ERROR
-
-if TYPE_CHECKING:
-    import pycolmap
 
 MIN_VIEWS = 2
 """Smallest number of cameras in which a point must be seen; rigs have few."""
@@ -87,8 +84,9 @@ def solve(database: Path, stills: FrameFiles, folder: Path, seed: int) -> int:
     return most
 
 
-def straightened(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
-    """Return the model with lenses without distortion, adjusted anew, if it fits almost as well; else the model."""
+def straightened(model: Any) -> Any:
+    """Return a COLMAP reconstruction with lenses without distortion, adjusted anew, if it fits almost as well; else the
+    given one."""
     if not model.points3D:
         return model
     straight = copy.deepcopy(model)
@@ -100,15 +98,14 @@ def straightened(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
     return straight if straight_misfit * (1.0 - LENS_GAIN) <= bent_misfit else model
 
 
-def _misfit(model: pycolmap.Reconstruction, distortion: bool) -> float:
+def _misfit(model: Any, distortion: bool) -> float:
     """Adjust a model in place, its distortion if asked; return the median over points of the mean reprojection error,
     pixels. Strays would dominate a mean."""
-    import pycolmap
-
-    options = pycolmap.BundleAdjustmentOptions()
-    options.print_summary, options.refine_extra_params = False, distortion
-    options.ceres.solver_options.num_threads = 1
-    pycolmap.bundle_adjustment(model, options)
+    with quiet() as pycolmap:
+        options = pycolmap.BundleAdjustmentOptions()
+        options.print_summary, options.refine_extra_params = False, distortion
+        options.ceres.solver_options.num_threads = 1
+        pycolmap.bundle_adjustment(model, options)
     model.update_point_3d_errors()
     return float(np.median([point.error for point in model.points3D.values()]))
 
