@@ -92,9 +92,7 @@ def _cloud(index: int, count: int, data: Dataset, flows: Flows, depths: Depths, 
     seen = depths.of(index)
     assert seen is not None, "asked for frames with a depth map only"
     inverse = seen.inverse.numpy()
-    rows, columns = np.nonzero(inverse > 0)
-    pixels = np.stack([columns, rows], 1).astype(np.float64)
-    points = placed(seen, pixels, inverse[rows, columns])
+    pixels, points = points_of(seen)
     moves = _region(pixels, *_moves(index, points, pixels, flows), inverse)
     moves[moves] = ~strays(points[moves])
     every = moves.nonzero()[0]
@@ -104,7 +102,15 @@ def _cloud(index: int, count: int, data: Dataset, flows: Flows, depths: Depths, 
     return FramePoints(index, pixels[kept], len(every), InstantPoints(*found, data.entries[index].time))
 
 
-def placed(seen: SeenDepth, pixels: np.ndarray, inverse: np.ndarray) -> np.ndarray:
+def points_of(seen: SeenDepth) -> tuple[np.ndarray, np.ndarray]:
+    """Return the pixels [P, 2] with known depth, and their points [P, 3], row by row."""
+    inverse = seen.inverse.numpy()
+    rows, columns = np.nonzero(inverse > 0)
+    pixels = np.stack([columns, rows], 1).astype(np.float64)
+    return pixels, _placed(seen, pixels, inverse[rows, columns])
+
+
+def _placed(seen: SeenDepth, pixels: np.ndarray, inverse: np.ndarray) -> np.ndarray:
     """Return the points [P, 3] at pixels [P, 2] with inverse depths [P]."""
     start, directions = ray_of(seen.camera, pixels)
     along = directions @ seen.camera.viewmat[2, :3].double().numpy()
@@ -125,7 +131,7 @@ def later_places(one: FramePoints, following: int, flows: Flows, depths: FrameDe
     height, width = seen.inverse.shape
     inverse = seen.inverse.numpy()[y.clip(0, height - 1), x.clip(0, width - 1)]
     known = certain[rows, columns] & (inverse > 0) & (x >= 0) & (y >= 0) & (x < width) & (y < height)
-    there[known] = placed(seen, targets[known], inverse[known])
+    there[known] = _placed(seen, targets[known], inverse[known])
     return torch.from_numpy(there).float()
 
 

@@ -14,7 +14,7 @@ import torch
 
 from ..runtime.progress import progress
 from ..seeding import generator
-from .depth_points import FramePoints, later_places, placed
+from .depth_points import FramePoints, later_places, points_of
 from .flow import Flows
 from .flow_points import InstantPoints, colors_at, strays
 from .standing_cameras import StandingCamera
@@ -80,10 +80,7 @@ def _moment(time: float, stereo: StereoDepths, count: int, seed: int, key: int) 
     for one, region, index in zip(views, changed, here.values()):
         seen = stereo.of(index)
         assert seen is not None, "moments are those of pairs"
-        inverse = seen.inverse.numpy()
-        rows, columns = np.nonzero(inverse > 0)
-        at = np.stack([columns, rows], 1).astype(np.float64)
-        places = placed(seen, at, inverse[rows, columns])
+        at, places = points_of(seen)
         moves = one.sees(places, region)[1]
         # What stands still behind a mover's path looks as usual.
         moves[moves] = moving_points(places[moves], views, changed)

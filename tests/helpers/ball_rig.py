@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 
 from helpers.ball_and_wall import standing_camera
@@ -9,7 +11,7 @@ from scgs_warp.data.dataset import Dataset
 from scgs_warp.geometry.normalisation import Normalisation
 from scgs_warp.training.standing_cameras import standing_cameras
 from scgs_warp.training.stereo_depth import StereoDepths
-from scgs_warp.types import Camera
+from scgs_warp.types import Camera, Frame
 
 ANGLES = (-20.0, -10.0, 0.0, 10.0, 20.0)
 HEIGHTS = (0.3, 0.8, 0.3, 0.8, 0.3)
@@ -27,6 +29,12 @@ def rig_views(angles=ANGLES, heights=HEIGHTS, moments: int = MOMENTS) -> list[tu
         for angle, height in zip(angles, heights)
         for moment in range(moments)
     ]
+
+
+def changed_film(film: Dataset, change: Callable[[Frame, int], Frame]) -> Dataset:
+    """The film with changed frames; the second argument of ``change`` is a frame's index."""
+    frames = [change(frame, index) for index, frame in enumerate(film)]
+    return Dataset(frames, folder=film.folder, split="train", points=film.points, colors=film.colors)
 
 
 def standing_in(film: Dataset):

@@ -10,13 +10,13 @@ import pytest
 import torch
 
 from helpers.ball_and_wall import SIZE, filmed, standing_camera
-from helpers.ball_rig import ANGLES, HEIGHTS, MOMENTS, place_at, rig_views, stereo_of
+from helpers.ball_rig import ANGLES, HEIGHTS, MOMENTS, changed_film, place_at, rig_views, stereo_of
 from helpers.steps import check_same_bits
 from helpers.tiny import tiny_config
 from scgs_warp.data.dataset import Dataset
 from scgs_warp.errors import FrameError, UserError
 from scgs_warp.training import stereo_depth
-from scgs_warp.training.depth_points import placed
+from scgs_warp.training.depth_points import points_of
 from scgs_warp.training.frames import Frames
 from scgs_warp.training.state import TrainState
 from scgs_warp.training.stereo import StereoPair
@@ -41,12 +41,9 @@ def surfaces(film: Dataset, normalisation, depths, index: int) -> tuple[np.ndarr
     """Where the depth of a frame is known [h, w], and of the known pixels the distance of their points from the wall,
     and from the ball."""
     seen = depths.of(index)
-    inverse = seen.inverse.numpy()
-    rows, columns = np.nonzero(inverse > 0)
-    points = placed(seen, np.stack([columns, rows], 1).astype(np.float64), inverse[rows, columns])
-    points = points / normalisation.scale + np.asarray(normalisation.centre)
+    points = points_of(seen)[1] / normalisation.scale + np.asarray(normalisation.centre)
     ball = np.linalg.norm(points - place_at(film.entries[index].time).double().numpy(), axis=1) - RADIUS
-    return inverse > 0, np.abs(points[:, 1] - WALL), np.abs(ball)
+    return seen.inverse.numpy() > 0, np.abs(points[:, 1] - WALL), np.abs(ball)
 
 
 def test_depth_is_that_of_wall_and_ball(film, stereo):
@@ -120,13 +117,7 @@ def test_pairs_take_turns_where_there_are_many(film, monkeypatch, most, all_pair
 def test_masked_pixels_have_no_depth(film):
     mask = torch.ones(SIZE, SIZE, dtype=torch.bool)
     mask[: SIZE // 2] = False
-    masked = Dataset(
-        [dataclasses.replace(frame, mask=mask) for frame in film],
-        folder=film.folder,
-        split="train",
-        points=film.points,
-        colors=film.colors,
-    )
+    masked = changed_film(film, lambda frame, _: dataclasses.replace(frame, mask=mask))
     inverse = stereo_of(masked)[1].of(3).inverse
     assert not inverse[: SIZE // 2].any() and (inverse[SIZE // 2 :] > 0).float().mean() > 0.4
 
@@ -171,8 +162,7 @@ def test_there_is_no_stereo_where_nothing_would_be_compared(film, lack):
     state = TrainState.begin(config(**changes.get(lack, {})), film, "cpu")
     data = film
     if lack == "alpha":
-        frames = [dataclasses.replace(frame, alpha=torch.ones(SIZE, SIZE)) for frame in film]
-        data = Dataset(frames, folder=film.folder, split="train", points=film.points, colors=film.colors)
+        data = changed_film(film, lambda frame, _: dataclasses.replace(frame, alpha=torch.ones(SIZE, SIZE)))
     elif lack == "few points":
         data = Dataset(tuple(film), folder=film.folder, split="train", points=film.points[:2], colors=film.colors[:2])
     elif lack == "late":

@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from helpers.ball_and_wall import SIZE, ball, filmed, standing_camera, walking_camera, wall
-from helpers.ball_rig import ANGLES, MOMENTS, place_at, rig_views, standing_in, stereo_of
+from helpers.ball_rig import ANGLES, MOMENTS, changed_film, place_at, rig_views, standing_in, stereo_of
 from helpers.tiny import tiny_config
 from scgs_warp.data.dataset import Dataset
 from scgs_warp.geometry.normalisation import Normalisation
@@ -90,13 +90,7 @@ def test_pixels_outside_masks_do_not_move(film, shown):
 
 def test_what_moves_under_a_mask_is_not_sought(film):
     none = torch.zeros(SIZE, SIZE, dtype=torch.bool)
-    data = Dataset(
-        [dataclasses.replace(frame, mask=none) for frame in film],
-        folder=film.folder,
-        split="train",
-        points=film.points,
-        colors=film.colors,
-    )
+    data = changed_film(film, lambda frame, _: dataclasses.replace(frame, mask=none))
     assert not any(one.moves.any() for one in standing_in(data)[1])
 
 
@@ -158,8 +152,7 @@ def test_small_regions_at_the_edges_are_harmless(film, corner):
 
 def test_a_change_of_exposure_is_no_motion():
     still = filmed(rig_views(), None)
-    dim = [dataclasses.replace(frame, image=frame.image * (0.8 + 0.05 * (k % 7))) for k, frame in enumerate(still)]
-    data = Dataset(dim, folder=still.folder, split="train", points=still.points, colors=still.colors)
+    data = changed_film(still, lambda frame, k: dataclasses.replace(frame, image=frame.image * (0.8 + 0.05 * (k % 7))))
     _, standing = standing_in(data)
     assert len(standing) == len(ANGLES) and max(one.moves.mean() for one in standing) < 0.01
 
