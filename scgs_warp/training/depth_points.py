@@ -16,6 +16,7 @@ from torch import Tensor
 
 from ..data.dataset import Dataset, spread
 from ..geometry.optical_flow import targets_of
+from ..geometry.view_rays import pixels_of, ray_of
 from ..runtime.progress import progress
 from ..runtime.search_tree import search_tree
 from ..seeding import generator
@@ -23,7 +24,6 @@ from ..types import Camera
 from .depth import Depths, FrameDepths, SeenDepth
 from .flow import Flows
 from .flow_points import LEAST_REGION, InstantPoints, colors_at, strays
-from .view_rays import pixels_of, ray_of
 
 MOST_MOMENTS = 24
 """Largest number of moments at which points are sought."""

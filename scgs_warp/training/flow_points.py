@@ -16,11 +16,11 @@ from torch import Tensor
 
 from ..data.dataset import Dataset, spread
 from ..geometry.optical_flow import targets_of
+from ..geometry.view_rays import pixels_of, ray_of
 from ..runtime.progress import progress
 from ..runtime.search_tree import search_tree
 from ..types import Camera
 from .flow import Flows
-from .view_rays import pixels_of, ray_of
 
 CANDIDATES = 12
 """Number of instants that are tried; the one at which most pixels have a plausible depth is taken."""

@@ -11,9 +11,9 @@ import torch
 from torch import Tensor
 
 from ..data.dataset import Dataset, spread
+from ..geometry.view_rays import pixels_of
 from ..runtime.progress import progress
 from ..types import Camera, Frame
-from .view_rays import pixels_of
 
 LEAST_MOMENTS = 4
 """Least number of frames of a standing camera."""

@@ -15,19 +15,16 @@ from torch import Tensor
 
 from ..data.dataset import Dataset, spread
 from ..errors import FrameError, UserError
+from ..geometry.cameras import scaled_camera
 from ..geometry.normalisation import Normalisation
+from ..geometry.stereo import stereo_pairs
+from ..geometry.view_rays import pixels_of
 from ..runtime.progress import progress
-from ..types import Frame
-from .depth import KEPT_MIB, SeenDepth, seen_depth
+from ..types import Camera, Frame
+from .depth import SeenDepth, seen_depth
 from .flow import flow_size
 from .standing_cameras import StandingCamera, levels, standing_cameras
-from .stereo import StereoPair
-from .view_rays import pixels_of
 
-NEIGHBORS = 2
-"""Number of cameras with which each camera is paired."""
-NARROWEST, WIDEST = 1.0, 40.0
-"""Range of the angle between two paired cameras, as seen from the content, degrees."""
 MOST_MOMENTS, MOST_MATCHES = 24, 160
 """Largest number of moments that are matched, and about the largest number of matches in all. With more pairs of
 cameras, moments take turns with them, except the middle one, where Gaussians begin."""
@@ -49,13 +46,13 @@ class StereoDepths:
             known: [P, 3] sparse points of the data, in the frame of the cameras' poses.
         """
         self.data, self.standing = data, standing
-        self.pairs = _pairs(known, standing)
+        self.pairs = stereo_pairs(dict(enumerate(one.camera for one in standing)), known.double().numpy())
         """By the cameras' numbers."""
         self._camera_of = {index: number for number, one in enumerate(standing) for index in one.frames}
-        self._kept: dict[int, SeenDepth] = {}
-        """Those of the matched moments, and of other frames as far as they fit."""
-        self._bytes = 0
-        """Of those other frames."""
+        self._matched: dict[int, SeenDepth] = {}
+        """Depth of the frames at matched moments."""
+        self._known: dict[int, np.ndarray] = {}
+        """Which pixels of other frames have the depth of what stands still, as bits: a rig may have many frames."""
         every = self._instants()
         self.moments = [every[index] for index in spread(len(every), MOST_MOMENTS)] if self.pairs else []
         turns = math.ceil(len(self.pairs) * len(self.moments) / MOST_MATCHES)
@@ -78,18 +75,21 @@ class StereoDepths:
         Raises:
             FrameError: the frame's file is no longer readable.
         """
-        if index in self._kept or not self.pairs:
-            return self._kept.get(index)
-        try:
-            frame = self.data[index]
-        except UserError as error:
-            raise FrameError(str(error)) from error
+        if index in self._matched or not self.pairs:
+            return self._matched.get(index)
         number = self._camera_of[index]
-        seen = self._seen(number, frame, np.where(self._changed(number, frame), np.float32(0.0), self._still[number]))
-        if self._bytes + seen.inverse.nbytes <= KEPT_MIB * 2**20:
-            self._kept[index] = seen
-            self._bytes += seen.inverse.nbytes
-        return seen
+        depth = self._still[number]
+        if index not in self._known:
+            try:
+                frame = self.data[index]
+            except UserError as error:
+                raise FrameError(str(error)) from error
+            seen = self._seen(number, frame, np.where(self._changed(number, frame), np.float32(0.0), depth))
+            self._known[index] = np.packbits(seen.inverse.numpy() > 0)
+        known = np.unpackbits(self._known[index], count=depth.size).reshape(depth.shape)
+        with np.errstate(divide="ignore"):
+            inverse = np.where(known, 1.0 / np.maximum(depth, 1e-30), 0.0).astype(np.float32)
+        return SeenDepth(scaled_camera(self.standing[number].camera, *self.size(number)), torch.from_numpy(inverse))
 
     def size(self, number: int) -> tuple[int, int]:
         """Return width and height of the depth of a camera's frames."""
@@ -118,52 +118,37 @@ class StereoDepths:
             enlarged = cv2.resize(one.still, (one.camera.width, one.camera.height), interpolation=cv2.INTER_CUBIC)
             pictures[number] = enlarged.round().clip(0, 255).astype(np.uint8)
         everywhere = {number: np.ones(picture.shape[:2], bool) for number, picture in pictures.items()}
-        points = self._points(list(self.pairs), pictures, everywhere)
-        return [self._fused(number, each) for number, each in enumerate(points)]
+        return [each.depth() for each in self._mapped(list(self.pairs), pictures, everywhere)]
 
     def _match(self, time: float, pairs: list[tuple[int, int]]) -> None:
         """Match the images of a moment where they differ from the medians."""
-        frames = {number: self.data[index] for number, index in self.frames_at(time).items()}
+        here = self.frames_at(time)
+        frames = {number: self.data[index] for number, index in here.items()}
         pictures = {number: levels(frame.image) for number, frame in frames.items()}
         changed = {
             number: self.standing[number].whole(self.standing[number].changed(frame))
             for number, frame in frames.items()
         }
-        points = self._points([pair for pair in pairs if {*pair} <= {*frames}], pictures, changed)
-        for number, index in self.frames_at(time).items():
-            if points[number]:
-                depth = self._fused(number, points[number])
-                depth = np.where(self._changed(number, frames[number]), depth, self._still[number])
-                self._kept[index] = self._seen(number, frames[number], depth)
+        pairs = [pair for pair in pairs if {*pair} <= {*frames}]
+        maps = self._mapped(pairs, pictures, changed)
+        for number in {number for pair in pairs for number in pair}:
+            depth = np.where(self._changed(number, frames[number]), maps[number].depth(), self._still[number])
+            self._matched[here[number]] = self._seen(number, frames[number], depth)
 
-    def _points(
+    def _mapped(
         self, pairs: list[tuple[int, int]], pictures: dict[int, np.ndarray], regions: dict[int, np.ndarray]
-    ) -> list[list[np.ndarray]]:
-        """Match pairs in regions of their first cameras: for each camera, the points [P, 3] of each of its pairs."""
-        points: list[list[np.ndarray]] = [[] for _ in self.standing]
+    ) -> list[_DepthMap]:
+        """Match pairs in regions of their first cameras, and gather the points in the maps of both."""
+        maps = [_DepthMap(one.camera, self.size(number)) for number, one in enumerate(self.standing)]
         for one, two in pairs:
             found = self.pairs[one, two].match((pictures[one], pictures[two]), regions[one])[0]
             other = self.standing[two].camera
             pixels, depths = pixels_of(other, found)
             far_end = np.array([other.width, other.height]) - 1.0 - BORDER
             found = found[(depths > 0) & (pixels >= BORDER).all(1) & (pixels <= far_end).all(1)]
-            points[one].append(found)
-            points[two].append(found)
-        return points
-
-    def _fused(self, number: int, points: list[np.ndarray]) -> np.ndarray:
-        """Return the depth [h, w] of a camera where the points of its pairs agree, 0 elsewhere."""
-        camera, (width, height) = self.standing[number].camera, self.size(number)
-        pixels, depths = pixels_of(camera, np.concatenate([np.zeros((0, 3)), *points]))
-        places = (pixels + 0.5) / [camera.width, camera.height] * [width, height]
-        inside = (depths > 0) & (places >= 0).all(1) & (places < [width, height]).all(1)
-        columns, rows = np.floor(places[inside]).astype(int).T
-        logs, cells = np.log(depths[inside]), rows * width + columns
-        count = np.bincount(cells, minlength=width * height)
-        mean = np.bincount(cells, logs, width * height) / np.maximum(count, 1)
-        square = np.bincount(cells, np.square(logs - mean[cells]), width * height) / np.maximum(count, 1)
-        agreed = (count > 0) & (square < SPREAD**2)
-        return np.where(agreed, np.exp(mean), 0.0).reshape(height, width).astype(np.float32)
+            maps[one].add(found)
+            maps[two].add(found)
+        return maps
 
     def _changed(self, number: int, frame: Frame) -> np.ndarray:
         """Tell where a frame shows something else than the median, [h, w] bool, at the size of the depth."""
@@ -178,28 +163,36 @@ class StereoDepths:
         return seen_depth(depth, self.standing[number].camera)
 
 
+class _DepthMap:
+    """Depth of a camera, from the points of its pairs. Sums are kept, not points: those of a large rig are many."""
+
+    def __init__(self, camera: Camera, size: tuple[int, int]) -> None:
+        self._camera, self._size = camera, size
+        self._sums = np.zeros((3, size[0] * size[1]))
+        """Per pixel, the number of points and the sums of the logarithm of their depths and of its square."""
+
+    def add(self, points: np.ndarray) -> None:
+        """Add the points [P, 3] in view."""
+        camera, (width, height) = self._camera, self._size
+        pixels, depths = pixels_of(camera, points)
+        places = (pixels + 0.5) / [camera.width, camera.height] * [width, height]
+        inside = (depths > 0) & (places >= 0).all(1) & (places < [width, height]).all(1)
+        columns, rows = np.floor(places[inside]).astype(int).T
+        logs, cells = np.log(depths[inside]), rows * width + columns
+        for total, values in zip(self._sums, (None, logs, np.square(logs))):
+            total += np.bincount(cells, values, len(total))
+
+    def depth(self) -> np.ndarray:
+        """Return the depth [h, w] where the points agree, 0 elsewhere."""
+        count, total, squares = self._sums
+        mean = total / np.maximum(count, 1)
+        agreed = (count > 0) & (squares / np.maximum(count, 1) - np.square(mean) < SPREAD**2)
+        return np.where(agreed, np.exp(mean), 0.0).reshape(self._size[::-1]).astype(np.float32)
+
+
 def stereo_depths(data: Dataset, normalisation: Normalisation) -> StereoDepths | None:
     """Find the depth of a rig's frames by stereo; None if the cameras do not stand still, or the data has no points."""
     if data.points is None:
         return None
     standing = standing_cameras(data, [normalisation.apply_camera(camera) for camera in data.cameras])
     return StereoDepths(normalisation.apply(data.points).float(), data, standing) if standing else None
-
-
-def _pairs(known: Tensor, standing: list[StandingCamera]) -> dict[tuple[int, int], StereoPair]:
-    """Pair each camera with the nearest by angle, as seen from the content."""
-    places, pairs = known.double().numpy(), {}
-    middle = known.double().median(0).values
-    rays = torch.stack([one.camera.position.double() - middle for one in standing])
-    rays = torch.nn.functional.normalize(rays, dim=1)
-    angles = torch.rad2deg((rays @ rays.T).clamp(-1.0, 1.0).acos())
-    for one, own in enumerate(angles):
-        found = 0
-        for two in own.argsort(stable=True).tolist():
-            if found == NEIGHBORS or not NARROWEST <= own[two] <= WIDEST:
-                continue
-            key = min(one, two), max(one, two)
-            pair = pairs.get(key) or StereoPair.of(standing[key[0]].camera, standing[key[1]].camera, places)
-            if pair is not None:
-                pairs[key], found = pair, found + 1
-    return pairs

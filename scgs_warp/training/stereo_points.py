@@ -12,6 +12,7 @@ import itertools
 import numpy as np
 import torch
 
+from ..data.dataset import spread
 from ..runtime.progress import progress
 from ..seeding import generator
 from .depth_points import FramePoints, later_places, points_of
@@ -22,6 +23,9 @@ from .stereo_depth import StereoDepths
 
 FEWEST, ENOUGH = 50, 0.4
 """Least number of a moment's points, and as a share of the largest."""
+MOST_FOLLOWED = 1500
+"""About the largest number of frames between which flow is measured: of a large rig, only some cameras are followed, at
+least two."""
 SEEING_PER_BLIND = 4
 """Number of cameras that have a moving point in view, for each that may see no change there."""
 
@@ -59,16 +63,23 @@ def stereo_clouds(stereo: StereoDepths, flows: Flows, count: int, seed: int, key
         sizes = [sum(each.count for each in moment.values()) for moment in found]
         least = max(float(FEWEST), ENOUGH * max(sizes, default=0))
         kept = [(time, moment) for time, moment, size in zip(stereo.moments, found, sizes) if size >= least]
-        clouds = []
+        clouds, followed = [], _followed(stereo.standing)
         for (time, moment), following in itertools.zip_longest(kept, kept[1:]):
             cloud = _joined(moment, time)
             if following is not None:
-                later = [_later(each, following[1].get(number), flows, stereo) for number, each in moment.items()]
+                ends = {number: following[1].get(number) for number in followed}
+                later = [_later(each, ends.get(number), flows, stereo) for number, each in moment.items()]
                 cloud = cloud._replace(later=torch.cat(later))
             clouds.append(cloud)
             bar.advance()
         bar.advance(2 * len(stereo.moments) - len(found) - len(clouds))
     return clouds
+
+
+def _followed(standing: list[StandingCamera]) -> list[int]:
+    """Choose the cameras in whose films points are followed, by their numbers."""
+    most = MOST_FOLLOWED // max(len(one.frames) for one in standing)
+    return spread(len(standing), max(2, most))
 
 
 def _moment(time: float, stereo: StereoDepths, count: int, seed: int, key: int) -> dict[int, FramePoints]:

@@ -15,11 +15,11 @@ from helpers.steps import check_same_bits
 from helpers.tiny import tiny_config
 from scgs_warp.data.dataset import Dataset
 from scgs_warp.errors import FrameError, UserError
+from scgs_warp.geometry.stereo import StereoPair
 from scgs_warp.training import stereo_depth
 from scgs_warp.training.depth_points import points_of
 from scgs_warp.training.frames import Frames
 from scgs_warp.training.state import TrainState
-from scgs_warp.training.stereo import StereoPair
 from scgs_warp.training.view import prepare
 
 WALL, RADIUS = 2.0, 0.5
@@ -67,13 +67,19 @@ def test_frames_between_the_moments_have_the_depth_of_what_stands_still(film, mo
         assert on_ball > 0.01 if film.entries[index].time in depths.moments else on_ball < 0.005
 
 
-def test_maps_that_are_not_kept_are_made_again_with_the_same_bits(film, stereo, monkeypatch):
+def test_maps_between_the_moments_are_the_same_at_each_use(film, monkeypatch):
+    """Which pixels are known is kept, not their depth."""
     monkeypatch.setattr(stereo_depth, "MOST_MOMENTS", 3)
-    _, kept = stereo_of(film)
-    monkeypatch.setattr(stereo_depth, "KEPT_MIB", 0)
-    between = next(index for index in range(len(film)) if film.entries[index].time not in kept.moments)
-    first = kept.of(between).inverse
-    assert kept.of(between).inverse is not first and torch.equal(kept.of(between).inverse, first)
+    _, depths = stereo_of(film)
+    between = next(index for index in range(len(film)) if film.entries[index].time not in depths.moments)
+    made = []
+    seen_depth = stereo_depth.seen_depth
+    monkeypatch.setattr(stereo_depth, "seen_depth", lambda *args: made.append(seen_depth(*args)) or made[-1])
+    first, again = depths.of(between), depths.of(between)
+    assert len(made) == 1
+    for seen in (first, again):
+        assert torch.equal(seen.inverse, made[0].inverse)
+        assert torch.equal(seen.camera.K, made[0].camera.K) and seen.camera.width == made[0].camera.width
 
 
 def test_cameras_that_are_not_locked_share_their_instants():
@@ -90,14 +96,6 @@ def test_cameras_that_are_not_locked_share_their_instants():
     for number in range(len(ANGLES)):
         shown = [depths.frames_at(time)[number] for time in depths.moments if number in depths.frames_at(time)]
         assert len(shown) >= MOMENTS - 2 and len(set(shown)) >= len(shown) - 1
-
-
-def test_matched_depth_is_kept_whatever_its_size(film, monkeypatch):
-    monkeypatch.setattr(stereo_depth, "KEPT_MIB", 0)
-    normalisation, depths = stereo_of(film)
-    for index in range(0, len(film), 5):
-        _, _, ball = surfaces(film, normalisation, depths, index)
-        assert (ball < NEAR_BALL).mean() > 0.01
 
 
 @pytest.mark.parametrize(("most", "all_pairs"), [(1000, True), (14, False)])

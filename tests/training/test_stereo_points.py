@@ -14,12 +14,13 @@ from helpers.ball_rig import ANGLES, MOMENTS, changed_film, place_at, rig_views,
 from helpers.tiny import tiny_config
 from scgs_warp.data.dataset import Dataset
 from scgs_warp.geometry.normalisation import Normalisation
+from scgs_warp.geometry.stereo import StereoPair
+from scgs_warp.training import stereo_points
 from scgs_warp.training.flow import Flows
 from scgs_warp.training.points_on_movers import points_on_movers
 from scgs_warp.training.standing_cameras import levels
 from scgs_warp.training.start_motion import start_cloud
 from scgs_warp.training.state import TrainState
-from scgs_warp.training.stereo import StereoPair
 from scgs_warp.training.stereo_points import moving_points, stereo_clouds
 from scgs_warp.types import Camera
 
@@ -120,6 +121,19 @@ def test_cameras_without_a_frame_then_are_left_out(film):
     found, places = found_in(short, time=1.0)
     distance = (places - place_at(1.0).double()).norm(dim=1)
     assert len(found.points) > 100 and float(((distance - 0.5).abs() < 0.15).double().mean()) > 0.6
+
+
+def test_points_of_a_large_rig_are_followed_in_some_films_only(film, monkeypatch):
+    """Points of all cameras are taken, and those of others go along."""
+    measured = set()
+    path = Flows.between_frames
+    monkeypatch.setattr(Flows, "between_frames", lambda self, *ends: measured.add(ends[0]) or path(self, *ends))
+    monkeypatch.setattr(stereo_points, "MOST_FOLLOWED", 3 * MOMENTS)
+    _, clouds = clouds_in(film)
+    assert {index // MOMENTS for index in measured} == {0, 2, 4}
+    for cloud in clouds[:-1]:
+        tracked = cloud.later.isfinite().all(1).float().mean()
+        assert 0.2 < tracked < 0.8
 
 
 def test_a_camera_behind_another_is_not_matched_with_it():

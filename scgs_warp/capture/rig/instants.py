@@ -35,9 +35,9 @@ class TimeLine:
 
     @property
     def times(self) -> np.ndarray:
-        """[C, T] moments scaled to go from 0 at the first instant to 1 at the last."""
-        span = max(float(self.seconds[-1] - self.seconds[0]), 1e-9)
-        return ((self.moments - self.seconds[0]) / span).clip(0.0, 1.0)
+        """[C, T] moments scaled to go from 0 at the first of all cameras to 1 at the last."""
+        first, last = float(self.moments.min()), float(self.moments.max())
+        return (self.moments - first) / max(last - first, 1e-9)
 
 
 def frame_seconds(path: Path) -> np.ndarray:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import cv2
@@ -35,6 +36,10 @@ NO_END = 0.5
 """Distance from the ends of the range of disparities, pixels: what is beyond it is matched there."""
 LEAST_SIDE = 16
 """Least width and height of a region that is matched, pixels."""
+NEIGHBORS = 2
+"""Number of cameras with which each camera is paired."""
+NARROWEST, WIDEST = 1.0, 40.0
+"""Range of the angle between two paired cameras, as seen from the content, degrees."""
 
 
 class StereoPair(NamedTuple):
@@ -174,3 +179,26 @@ def _outline(camera: Camera, rotation: np.ndarray) -> tuple[np.ndarray, np.ndarr
     rays = corners @ np.linalg.inv(camera.K.double().numpy()).T @ camera.viewmat[:3, :3].double().numpy() @ rotation.T
     flat = rays[:, :2] / np.maximum(rays[:, 2:], LEAST_COSINE)
     return flat.min(0), flat.max(0)
+
+
+def stereo_pairs(cameras: Mapping[int, Camera], known: np.ndarray) -> dict[tuple[int, int], StereoPair]:
+    """Pair each camera with the nearest by angle, as seen from the content; return the pairs by the cameras' numbers,
+    the smaller first.
+
+    Args:
+        known: [P, 3] points of the content.
+    """
+    numbers, pairs = list(cameras), {}
+    rays = np.stack([cameras[number].position.double().numpy() for number in numbers]) - np.median(known, axis=0)
+    rays /= np.maximum(np.linalg.norm(rays, axis=1, keepdims=True), 1e-12)
+    angles = np.degrees(np.arccos((rays @ rays.T).clip(-1.0, 1.0)))
+    for number, own in zip(numbers, angles):
+        found = 0
+        for place in own.argsort(kind="stable"):
+            if found == NEIGHBORS or not NARROWEST <= own[place] <= WIDEST:
+                continue
+            one, two = sorted((number, numbers[place]))
+            pair = pairs.get((one, two)) or StereoPair.of(cameras[one], cameras[two], known)
+            if pair is not None:
+                pairs[one, two], found = pair, found + 1
+    return pairs
