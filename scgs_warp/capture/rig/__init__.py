@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
-from .pipeline import RigRequest, RigResult, capture_rig
+from .pipeline import RigResult, capture_rig
+from .request import RigRequest
 
 __all__ = ["RigRequest", "RigResult", "capture_rig"]

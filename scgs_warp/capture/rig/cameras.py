@@ -19,6 +19,8 @@ FEW_INLIERS = (100, 50, 25)
 """Smallest numbers of matches of the first pair of cameras, tried one after the other: cameras of a rig stand far
 apart."""
 
+ROBUST = 0.5
+"""Reprojection error, pixels, beyond which an observation pulls less and less."""
 LENS_GAIN = 0.01
 """Least share by which distortion must lower the median reprojection error. A few pictures can hardly tell distortion
 from focal length, and a distortion that explains next to nothing bends the scene."""
@@ -85,29 +87,39 @@ def solve(database: Path, stills: FrameFiles, folder: Path, seed: int) -> int:
 
 
 def straightened(model: Any) -> Any:
-    """Return a COLMAP reconstruction with lenses without distortion, adjusted anew, if it fits almost as well; else the
-    given one."""
+    """Return a COLMAP reconstruction adjusted anew, with lenses without distortion if these fit almost as well."""
     if not model.points3D:
         return model
-    straight = copy.deepcopy(model)
+    bent, straight = copy.deepcopy(model), copy.deepcopy(model)
     for lens in straight.cameras.values():
         params = np.array(lens.params)
         params[lens.extra_params_idxs()] = 0.0
         lens.params = params
-    bent_misfit, straight_misfit = _misfit(copy.deepcopy(model), True), _misfit(straight, False)
-    return straight if straight_misfit * (1.0 - LENS_GAIN) <= bent_misfit else model
+    errors = [_adjusted(bent, True), _adjusted(straight, False)]
+    return straight if errors[1] * (1.0 - LENS_GAIN) <= errors[0] else bent
 
 
-def _misfit(model: Any, distortion: bool) -> float:
-    """Adjust a model in place, its distortion if asked; return the median over points of the mean reprojection error,
-    pixels. Strays would dominate a mean."""
+def _adjusted(model: Any, distortion: bool) -> float:
+    """Adjust a model in place, its distortion if asked; return the median error."""
     with quiet() as pycolmap:
         options = pycolmap.BundleAdjustmentOptions()
         options.print_summary, options.refine_extra_params = False, distortion
+        options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
+        options.ceres.loss_function_scale = ROBUST
         options.ceres.solver_options.num_threads = 1
-        pycolmap.bundle_adjustment(model, options)
+        # pycolmap.bundle_adjustment would write to the user's terminal.
+        config = pycolmap.BundleAdjustmentConfig()
+        for image in model.reg_image_ids():
+            config.add_image(image)
+        config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+        pycolmap.create_default_bundle_adjuster(options, config, model).solve()
+    return median_error(model)
+
+
+def median_error(model: Any) -> float:
+    """Return the median over a model's points of the mean reprojection error, pixels; strays would dominate a mean."""
     model.update_point_3d_errors()
-    return float(np.median([point.error for point in model.points3D.values()]))
+    return float(np.median([point.error for point in model.points3D.values()])) if model.points3D else 0.0
 
 
 def read_solution(folder: Path, names: Sequence[str]) -> RigSolution | None:
@@ -115,25 +127,29 @@ def read_solution(folder: Path, names: Sequence[str]) -> RigSolution | None:
     if not (folder / "images.bin").is_file():
         return None
     with quiet() as pycolmap:
-        model = pycolmap.Reconstruction(folder)
-        numbers = {name: number for number, name in enumerate(names)}
-        cameras = {}
-        for image in model.images.values():
-            if not image.has_pose:
-                continue
-            viewmat = np.eye(4)
-            viewmat[:3] = image.cam_from_world().matrix()
-            lens = model.cameras[image.camera_id]
-            params = tuple(float(value) for value in lens.params)
-            cameras[numbers[image.name]] = RigCamera(lens.model_name, params, lens.width, lens.height, viewmat)
-        points = [model.points3D[key] for key in sorted(model.points3D)]
-        kept = [p for p in points if p.track.length() >= MIN_VIEWS and p.error <= MAX_ERROR]
-        return RigSolution(
-            dict(sorted(cameras.items())),
-            np.array([point.xyz for point in kept], np.float64).reshape(-1, 3),
-            np.array([point.color for point in kept], np.uint8).reshape(-1, 3),
-            float(model.compute_mean_reprojection_error()),
-        )
+        return solution_of(pycolmap.Reconstruction(folder), names)
+
+
+def solution_of(model: Any, names: Sequence[str]) -> RigSolution:
+    """Return the cameras and points of a COLMAP reconstruction."""
+    numbers = {name: number for number, name in enumerate(names)}
+    cameras = {}
+    for image in model.images.values():
+        if not image.has_pose:
+            continue
+        viewmat = np.eye(4)
+        viewmat[:3] = image.cam_from_world().matrix()
+        lens = model.cameras[image.camera_id]
+        params = tuple(float(value) for value in lens.params)
+        cameras[numbers[image.name]] = RigCamera(lens.model_name, params, lens.width, lens.height, viewmat)
+    points = [model.points3D[key] for key in sorted(model.points3D)]
+    kept = [p for p in points if p.track.length() >= MIN_VIEWS and p.error <= MAX_ERROR]
+    return RigSolution(
+        dict(sorted(cameras.items())),
+        np.array([point.xyz for point in kept], np.float64).reshape(-1, 3),
+        np.array([point.color for point in kept], np.uint8).reshape(-1, 3),
+        float(model.compute_mean_reprojection_error()),
+    )
 
 
 Triangulated = tuple[np.ndarray, np.ndarray]

@@ -7,62 +7,31 @@ import math
 import shutil
 from collections.abc import Callable
 from contextlib import AbstractContextManager
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...data.natural_order import natural
 from ...errors import UserError
 from ...runtime.progress import progress
 from ...storage.json_files import as_number
 from ...visualization.video import write_png
 from .. import features, pictures
-from ..features import CameraModel, FrameFiles
+from ..features import FrameFiles
 from ..journal import Journal
 from ..source import Video, read_rgb
 from ..writing import FILE
-from . import cameras, still, synchronisation
+from . import adjustment, cameras, still, synchronisation
 from .instants import TimeLine, frame_seconds, time_line
 from .neural_video import POSES, known_cameras, write_neural_video
 from .points import points_at
+from .request import FEWEST_CAMERAS, RigRequest, check, videos_of
 from .sound import read_sound
 from .writing import write_rig
 
-VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".mkv", ".avi", ".webm")
-FEWEST_CAMERAS = 2
 SHEET = "contact_sheet.png"
 
 ShowProgress = Callable[[int, str], AbstractContextManager[Any]]
-
-
-@dataclass(frozen=True)
-class RigRequest:
-    """Settings of a rig's capture."""
-
-    folder: Path
-    """Folder with one video per camera."""
-    frames: int | None = None
-    """Number of instants; None: at most ``instants.RIG_INSTANTS``."""
-    start: float | None = None
-    end: float | None = None
-    """Part of the common time to use, in seconds from the moment at which all cameras record."""
-    offsets: tuple[float, ...] | None = None
-    """Seconds at which the videos begin, in the order of their names, or one number for all; None: found by sound."""
-    size: int = 1280
-    """Largest size of the longer side of the images, pixels."""
-    lens: Literal["auto", "shared", "each"] = "auto"
-    """``shared``: one lens for all cameras; ``each``: its own for each; ``auto``: shared if sizes are equal."""
-    camera_model: CameraModel = "SIMPLE_RADIAL"
-    fov: float | None = None
-    """Horizontal field of view, degrees; None if unknown."""
-    features: int = 4096
-    least: float = 0.5
-    """Smallest share of the cameras that must be found."""
-    held_out: str | None = None
-    """Name of the camera that is held out; None: the first."""
-    seed: int = 0
 
 
 class RigResult(NamedTuple):
@@ -77,61 +46,6 @@ class RigResult(NamedTuple):
     lines: list[str]
     """Description of the result, for the user."""
     made_before: bool
-
-
-def videos_of(folder: Path) -> list[Path]:
-    """Return the videos of a rig, in the natural order of their names.
-
-    Raises:
-        UserError: there are too few.
-    """
-    if not folder.is_dir():
-        raise UserError(f"--rig {folder}: no such folder; give the folder that holds one video per camera")
-    found = [path for path in folder.iterdir() if path.suffix.lower() in VIDEO_SUFFIXES and path.is_file()]
-    files = sorted((path for path in found if not path.name.startswith(".")), key=lambda path: natural(path.name))
-    if len(files) < FEWEST_CAMERAS:
-        raise UserError(
-            f"--rig {folder}: holds {len(files)} videos ({', '.join(VIDEO_SUFFIXES)}); give one video per camera, at "
-            f"least {FEWEST_CAMERAS}"
-        )
-    stems = [path.stem for path in files]
-    twice = next((name for name in stems if stems.count(name) > 1), None)
-    if twice is not None:
-        raise UserError(f"--rig {folder}: two videos are called {twice}; give each camera its own name")
-    return files
-
-
-def check(request: RigRequest, names: list[str]) -> None:
-    """Check the values of a request.
-
-    Raises:
-        UserError: naming the option, its value and the remedy.
-    """
-    if request.frames is not None and request.frames < 6:
-        raise UserError(f"--frames {request.frames}: give at least 6")
-    if not 64 <= request.size <= 8192:
-        raise UserError(f"--size {request.size}: give 64 to 8192 pixels")
-    if request.fov is not None and not 5.0 <= request.fov <= 170.0:
-        raise UserError(f"--fov {request.fov:g}: give 5 to 170 degrees")
-    if not 64 <= request.features <= 32768:
-        raise UserError(f"--features {request.features}: give 64 to 32768")
-    if not 0.0 <= request.least <= 1.0:
-        raise UserError(f"--least {request.least:g}: give a share from 0 to 1")
-    begin, end = request.start or 0.0, math.inf if request.end is None else request.end
-    if not 0.0 <= begin < end:
-        raise UserError(f"--start {begin:g} --end {end:g}: give two seconds of the common time, the earlier one first")
-    if not 0 <= request.seed < 2**31:
-        raise UserError(f"--seed {request.seed}: give 0 or more")
-    if request.offsets is not None:
-        if len(request.offsets) not in (1, len(names)):
-            raise UserError(
-                f"--offsets: {len(request.offsets)} numbers for {len(names)} videos ({', '.join(names)}); give one for "
-                "each, or a single 0 if all begin at once"
-            )
-        if not all(math.isfinite(value) and abs(value) < 1e6 for value in request.offsets):
-            raise UserError("--offsets: give seconds")
-    if request.held_out is not None and request.held_out not in names:
-        raise UserError(f"--held-out {request.held_out}: the cameras are {', '.join(names)}; name one of them")
 
 
 def capture_rig(request: RigRequest, folder: Path, *, device: str = "cpu", show: ShowProgress = progress) -> RigResult:
@@ -312,7 +226,7 @@ class _Rig:
     def cameras(self, instants: int) -> cameras.RigSolution:
         """Find the cameras with COLMAP, from pictures of ``instants`` moments."""
         request, stills = self.request, self._stills(instants)
-        database, model = self.work / "database.db", self.work / "model"
+        database, model, target = (self.work / name for name in ("database.db", "model", "adjusted"))
         count, chosen = len(self.names), cameras.pairs_of(len(self.names))
         sizes = {self.size_of(camera) for camera in range(count)}
         shared = request.lens == "shared" or (request.lens == "auto" and len(sizes) == 1)
@@ -341,7 +255,15 @@ class _Rig:
                 lambda: shutil.rmtree(model, ignore_errors=True),
             )
             bar.advance()
-        solved = cameras.read_solution(model, stills.names)
+        if cameras.read_solution(model, stills.names) is not None:
+            with self.show(adjustment.ROUNDS, "adjusting cameras") as bar:
+                self.journal.stage(
+                    "adjustment",
+                    None,
+                    lambda: adjustment.adjust(model, stills, target, bar.advance),
+                    lambda: shutil.rmtree(target, ignore_errors=True),
+                )
+        solved = cameras.read_solution(target, stills.names)
         self._draw(stills, set(solved.cameras) if solved else set())
         if solved is None:
             raise UserError(self._nothing_found(database, stills))

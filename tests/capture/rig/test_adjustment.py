@@ -1,0 +1,83 @@
+"""Cameras of a rig, adjusted to dense matches: exact where features left them open, or left as they are."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from helpers import textured_corner as corner
+from scgs_warp.capture.features import quiet
+from scgs_warp.capture.rig import adjustment
+from scgs_warp.capture.rig.cameras import read_solution, solution_of
+
+LENSES = {"straight": 0.0, "bent": -0.12}
+
+
+@pytest.fixture(scope="module", params=list(LENSES))
+def rig(request, tmp_path_factory):
+    true = corner.true_cameras(LENSES[request.param])
+    files = corner.stills(tmp_path_factory.mktemp(request.param), true)
+    return true, files, corner.model_of(true, files.names)
+
+
+def test_cameras_become_exact(rig):
+    true, files, model = rig
+    rounds = []
+    before = solution_of(model, files.names)
+    after = solution_of(adjustment.adjusted(model, files, lambda: rounds.append(1)), files.names)
+    loose, exact = (corner.misplaced(each.cameras, true) for each in (before, after))
+    assert loose > 0.5 and exact < 0.12, (loose, exact)
+    assert after.cameras[0].params[0] == pytest.approx(corner.FOCAL, rel=0.005)
+    assert after.cameras[0].params[3] == pytest.approx(true[0].params[3], abs=0.01)
+    assert len(rounds) == adjustment.ROUNDS
+    assert len(after.points) == len(before.points), "points stay those of the features"
+    assert (after.colors == before.colors).all() and len(set(after.colors[:, 0].tolist())) == len(after.colors)
+    again = solution_of(model, files.names)
+    assert (again.points == before.points).all() and again.cameras[1].params == before.cameras[1].params
+
+
+def test_the_same_bits_again_and_from_a_folder(rig, tmp_path):
+    _, files, model = rig
+    with quiet():
+        (tmp_path / "model").mkdir()
+        model.write_binary(tmp_path / "model")
+    adjustment.adjust(tmp_path / "model", files, tmp_path / "one")
+    adjustment.adjust(tmp_path / "model", files, tmp_path / "two")
+    for file in (tmp_path / "one").iterdir():
+        assert file.read_bytes() == (tmp_path / "two" / file.name).read_bytes()
+    assert read_solution(tmp_path / "one", files.names) is not None
+
+
+def test_masked_pixels_do_not_count(tmp_path, monkeypatch):
+    true = corner.true_cameras()
+    mask = np.full((corner.HEIGHT, corner.WIDTH), 255, np.uint8)
+    mask[60:180, 100:200] = 0
+    files = corner.stills(tmp_path, true, dict.fromkeys(true, mask))
+    for name in files.names[::2]:  # what moves is elsewhere in the next picture
+        image = cv2.imread(str(files.folder / name))
+        image[60:180, 100:200] = np.roll(image[60:180, 100:200], 9, axis=0)
+        cv2.imwrite(str(files.folder / name), image)
+    used = []
+    gathered = adjustment._gathered
+    monkeypatch.setattr(adjustment, "_gathered", lambda *args: used.append((args[0], gathered(*args))) or used[-1][1])
+    found = adjustment.adjusted(corner.model_of(true, files.names), files)
+    assert corner.misplaced(solution_of(found, files.names).cameras, true) < 0.2
+    for views, seen in used:
+        for number, view in views.items():
+            columns, rows = np.floor(seen.pixels[seen.cameras == number]).astype(int).T
+            assert len(rows) > 1000 and view.still.mean() < 0.9 and view.still[rows, columns].mean() > 0.999
+
+
+@pytest.mark.parametrize("lack", ["texture", "overlap", "fit"])
+def test_cameras_stay_as_they_are(tmp_path, monkeypatch, lack):
+    true = corner.true_cameras(angles=(-75.0, -25.0, 25.0, 75.0) if lack == "overlap" else corner.ANGLES)
+    files = corner.stills(tmp_path, true)
+    if lack == "texture":
+        for name in files.names:
+            cv2.imwrite(str(files.folder / name), np.full((corner.HEIGHT, corner.WIDTH, 3), 128, np.uint8))
+    if lack == "fit":
+        monkeypatch.setattr(adjustment, "LOOSER", 0.0)
+        monkeypatch.setattr(adjustment, "TOLERATED", 0.0)
+    model = corner.model_of(true, files.names)
+    assert adjustment.adjusted(model, files) is model
