@@ -9,7 +9,8 @@ import pytest
 from helpers import textured_corner as corner
 from scgs_warp.capture.features import quiet
 from scgs_warp.capture.rig import adjustment
-from scgs_warp.capture.rig.cameras import read_solution, solution_of
+from scgs_warp.capture.rig.cameras import median_error, read_solution, solution_of
+from scgs_warp.geometry.view_rays import pixels_of
 
 LENSES = {"straight": 0.0, "bent": -0.12}
 
@@ -37,7 +38,30 @@ def test_cameras_become_exact(rig):
     assert (again.points == before.points).all() and again.cameras[1].params == before.cameras[1].params
 
 
-def test_the_same_bits_again_and_from_a_folder(rig, tmp_path):
+def test_exact_features_still_fit(tmp_path):
+    """Dense matches have the features' convention of pixels."""
+    true = corner.true_cameras()
+    files = corner.stills(tmp_path, true)
+    found = adjustment.adjusted(corner.model_of(true, files.names, noise=0.0), files)
+    assert median_error(found) < 0.15
+    assert corner.misplaced(solution_of(found, files.names).cameras, true) < 0.05
+
+
+def test_points_that_do_not_fit_their_pixels_are_left_out(rig):
+    _, files, model = rig
+    views = adjustment._views(model, files)
+    true = np.array([[0.0, 0.2, 4.5], [0.3, -0.2, 4.8], [-0.4, 0.1, 4.6]])
+    pixels = np.concatenate([pixels_of(view.camera, true)[0] for view in views.values()])
+    seen = adjustment._Seen(np.tile(np.arange(3), len(views)), np.repeat(list(views), 3), pixels)
+    points, kept = adjustment._placed(views, seen)
+    np.testing.assert_allclose(points, true, atol=1e-6)
+    assert kept.all()
+    seen.pixels[4] += [0.0, 3 * adjustment.MOST_APART * corner.WIDTH]
+    assert adjustment._placed(views, seen)[1].tolist() == [True, False, True]
+
+
+def test_the_same_bits_again_and_from_a_folder(rig, tmp_path, monkeypatch):
+    monkeypatch.setattr(adjustment, "ROUNDS", 1)
     _, files, model = rig
     with quiet():
         (tmp_path / "model").mkdir()
@@ -58,6 +82,7 @@ def test_masked_pixels_do_not_count(tmp_path, monkeypatch):
         image = cv2.imread(str(files.folder / name))
         image[60:180, 100:200] = np.roll(image[60:180, 100:200], 9, axis=0)
         cv2.imwrite(str(files.folder / name), image)
+    monkeypatch.setattr(adjustment, "ROUNDS", 2)
     used = []
     gathered = adjustment._gathered
     monkeypatch.setattr(adjustment, "_gathered", lambda *args: used.append((args[0], gathered(*args))) or used[-1][1])
@@ -77,6 +102,7 @@ def test_cameras_stay_as_they_are(tmp_path, monkeypatch, lack):
         for name in files.names:
             cv2.imwrite(str(files.folder / name), np.full((corner.HEIGHT, corner.WIDTH, 3), 128, np.uint8))
     if lack == "fit":
+        monkeypatch.setattr(adjustment, "ROUNDS", 1)
         monkeypatch.setattr(adjustment, "LOOSER", 0.0)
         monkeypatch.setattr(adjustment, "TOLERATED", 0.0)
     model = corner.model_of(true, files.names)
