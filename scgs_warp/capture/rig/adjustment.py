@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import copy
 import math
+import shutil
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -103,6 +104,7 @@ def adjust(folder: Path, stills: FrameFiles, target: Path, done: Callable[[], ob
     """Read the model in a folder, and write the adjusted one to another."""
     with quiet() as pycolmap:
         model = adjusted(pycolmap.Reconstruction(folder), stills, done)
+        shutil.rmtree(target, ignore_errors=True)  # an interrupted attempt
         target.mkdir()
         model.write_binary(target)
 

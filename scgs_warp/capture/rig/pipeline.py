@@ -255,7 +255,8 @@ class _Rig:
                 lambda: shutil.rmtree(model, ignore_errors=True),
             )
             bar.advance()
-        if cameras.read_solution(model, stills.names) is not None:
+        # Captures that earlier versions finished have no adjusted cameras.
+        if model.is_dir() and (self.journal.knows("adjustment") or not self.journal.finished):
             with self.show(adjustment.ROUNDS, "adjusting cameras") as bar:
                 self.journal.stage(
                     "adjustment",
@@ -263,7 +264,8 @@ class _Rig:
                     lambda: adjustment.adjust(model, stills, target, bar.advance),
                     lambda: shutil.rmtree(target, ignore_errors=True),
                 )
-        solved = cameras.read_solution(target, stills.names)
+            model = target
+        solved = cameras.read_solution(model, stills.names)
         self._draw(stills, set(solved.cameras) if solved else set())
         if solved is None:
             raise UserError(self._nothing_found(database, stills))

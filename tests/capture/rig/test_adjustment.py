@@ -67,6 +67,8 @@ def test_the_same_bits_again_and_from_a_folder(rig, tmp_path, monkeypatch):
         (tmp_path / "model").mkdir()
         model.write_binary(tmp_path / "model")
     adjustment.adjust(tmp_path / "model", files, tmp_path / "one")
+    (tmp_path / "two").mkdir()
+    (tmp_path / "two/points3D.bin").write_bytes(b"of an interrupted attempt")
     adjustment.adjust(tmp_path / "model", files, tmp_path / "two")
     for file in (tmp_path / "one").iterdir():
         assert file.read_bytes() == (tmp_path / "two" / file.name).read_bytes()
