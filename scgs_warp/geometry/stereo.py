@@ -189,6 +189,8 @@ def stereo_pairs(cameras: Mapping[int, Camera], known: np.ndarray) -> dict[tuple
         known: [P, 3] points of the content.
     """
     numbers, pairs = list(cameras), {}
+    if not len(known):
+        return pairs
     rays = np.stack([cameras[number].position.double().numpy() for number in numbers]) - np.median(known, axis=0)
     rays /= np.maximum(np.linalg.norm(rays, axis=1, keepdims=True), 1e-12)
     angles = np.degrees(np.arccos((rays @ rays.T).clip(-1.0, 1.0)))

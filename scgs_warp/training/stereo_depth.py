@@ -91,6 +91,10 @@ class StereoDepths:
             inverse = np.where(known, 1.0 / np.maximum(depth, 1e-30), 0.0).astype(np.float32)
         return SeenDepth(scaled_camera(self.standing[number].camera, *self.size(number)), torch.from_numpy(inverse))
 
+    def matches(self, index: int) -> bool:
+        """Return True for a frame whose images were matched at its own moment, so that movers have depth."""
+        return index in self._matched
+
     def size(self, number: int) -> tuple[int, int]:
         """Return width and height of the depth of a camera's frames."""
         camera = self.standing[number].camera

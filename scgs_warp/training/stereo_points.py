@@ -63,11 +63,11 @@ def stereo_clouds(stereo: StereoDepths, flows: Flows, count: int, seed: int, key
         sizes = [sum(each.count for each in moment.values()) for moment in found]
         least = max(float(FEWEST), ENOUGH * max(sizes, default=0))
         kept = [(time, moment) for time, moment, size in zip(stereo.moments, found, sizes) if size >= least]
-        clouds, followed = [], _followed(stereo.standing)
+        clouds = []
         for (time, moment), following in itertools.zip_longest(kept, kept[1:]):
             cloud = _joined(moment, time)
             if following is not None:
-                ends = {number: following[1].get(number) for number in followed}
+                ends = _followed(moment, following[1], stereo)
                 later = [_later(each, ends.get(number), flows, stereo) for number, each in moment.items()]
                 cloud = cloud._replace(later=torch.cat(later))
             clouds.append(cloud)
@@ -76,10 +76,21 @@ def stereo_clouds(stereo: StereoDepths, flows: Flows, count: int, seed: int, key
     return clouds
 
 
-def _followed(standing: list[StandingCamera]) -> list[int]:
-    """Choose the cameras in whose films points are followed, by their numbers."""
-    most = MOST_FOLLOWED // max(len(one.frames) for one in standing)
-    return spread(len(standing), max(2, most))
+def _followed(
+    moment: dict[int, FramePoints], following: dict[int, FramePoints], stereo: StereoDepths
+) -> dict[int, FramePoints]:
+    """Choose the cameras in whose films points are followed from a moment to the next: where movers have depth at both.
+
+    Returns:
+        Their points at the next moment, by the number of the camera.
+    """
+    able = [
+        number
+        for number, each in moment.items()
+        if number in following and stereo.matches(each.index) and stereo.matches(following[number].index)
+    ]
+    most = MOST_FOLLOWED // max(len(one.frames) for one in stereo.standing)
+    return {able[place]: following[able[place]] for place in spread(len(able), max(2, most))}
 
 
 def _moment(time: float, stereo: StereoDepths, count: int, seed: int, key: int) -> dict[int, FramePoints]:

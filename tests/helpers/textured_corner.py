@@ -75,7 +75,9 @@ def stills(folder: Path, cameras: dict[int, RigCamera], masks: dict[int, np.ndar
     return FrameFiles(folder / "stills", names, folder / "masks")
 
 
-def model_of(cameras: dict[int, RigCamera], names: list[str], features: int = 60, noise: float = 0.4):
+def model_of(
+    cameras: dict[int, RigCamera], names: list[str], features: int = 60, noise: float = 0.4, shared: bool = True
+):
     """Return a reconstruction from features in the middle of the pictures, whose places err by ``noise`` pixels."""
     random = np.random.default_rng(2)
     points = np.stack(
@@ -84,12 +86,14 @@ def model_of(cameras: dict[int, RigCamera], names: list[str], features: int = 60
     points[::3, 1:] = np.stack([np.full(len(points[::3]), FLOOR), random.uniform(4.0, 4.8, len(points[::3]))], 1)
     with quiet() as pycolmap:
         model = pycolmap.Reconstruction()
-        lens = lens_of(pycolmap, cameras[0])
-        lens.camera_id = 1
-        model.add_camera_with_trivial_rig(lens)
         for number, camera in cameras.items():
+            own = 1 if shared else number + 1
+            if not model.exists_camera(own):
+                lens = lens_of(pycolmap, camera)
+                lens.camera_id = own
+                model.add_camera_with_trivial_rig(lens)
             pixels = project(camera, points) + random.normal(0.0, noise, (features, 2))
-            image = pycolmap.Image(name=names[number], points2D=[pycolmap.Point2D(p) for p in pixels], camera_id=1)
+            image = pycolmap.Image(name=names[number], points2D=[pycolmap.Point2D(p) for p in pixels], camera_id=own)
             image.image_id = number + 1
             pose = pycolmap.Rigid3d(pycolmap.Rotation3d(camera.viewmat[:3, :3]), camera.viewmat[:3, 3])
             model.add_image_with_trivial_frame(image, pose)

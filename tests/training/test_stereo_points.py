@@ -15,7 +15,7 @@ from helpers.tiny import tiny_config
 from scgs_warp.data.dataset import Dataset
 from scgs_warp.geometry.normalisation import Normalisation
 from scgs_warp.geometry.stereo import StereoPair
-from scgs_warp.training import stereo_points
+from scgs_warp.training import stereo_depth, stereo_points
 from scgs_warp.training.flow import Flows
 from scgs_warp.training.points_on_movers import points_on_movers
 from scgs_warp.training.standing_cameras import levels
@@ -123,17 +123,22 @@ def test_cameras_without_a_frame_then_are_left_out(film):
     assert len(found.points) > 100 and float(((distance - 0.5).abs() < 0.15).double().mean()) > 0.6
 
 
-def test_points_of_a_large_rig_are_followed_in_some_films_only(film, monkeypatch):
-    """Points of all cameras are taken, and those of others go along."""
-    measured = set()
+@pytest.mark.parametrize("turns", [False, True])
+def test_points_of_a_large_rig_are_followed_in_some_films_only(film, monkeypatch, turns):
+    """Points of all cameras are taken, and those of others go along. Cameras are followed where they are matched."""
+    if turns:  # of the pairs
+        monkeypatch.setattr(stereo_depth, "MOST_MATCHES", 28)
+    measured = []
     path = Flows.between_frames
-    monkeypatch.setattr(Flows, "between_frames", lambda self, *ends: measured.add(ends[0]) or path(self, *ends))
+    monkeypatch.setattr(Flows, "between_frames", lambda self, *ends: measured.append(ends) or path(self, *ends))
     monkeypatch.setattr(stereo_points, "MOST_FOLLOWED", 3 * MOMENTS)
     _, clouds = clouds_in(film)
-    assert {index // MOMENTS for index in measured} == {0, 2, 4}
+    followed = [{one // MOMENTS for one, _ in measured if one % MOMENTS == moment} for moment in range(MOMENTS - 1)]
+    assert all(len(cameras) <= 3 for cameras in followed) and max(map(len, followed)) == 3
+    if not turns:
+        assert all(cameras == {0, 2, 4} for cameras in followed)
     for cloud in clouds[:-1]:
-        tracked = cloud.later.isfinite().all(1).float().mean()
-        assert 0.2 < tracked < 0.8
+        assert 0.1 < cloud.later.isfinite().all(1).float().mean() < 0.9
 
 
 def test_a_camera_behind_another_is_not_matched_with_it():

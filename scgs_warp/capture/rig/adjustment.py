@@ -25,22 +25,28 @@ from ...geometry.view_rays import pixels_of, ray_of
 from ...types import Camera
 from ..features import FrameFiles, quiet
 from ..source import read_rgb
-from .cameras import median_error, solution_of, straightened
-from .writing import Maps, common_pinholes
+from .cameras import RigCamera, median_error, solution_of, straightened
+from .points import lens_of
+from .writing import common_pinholes
 
 ROUNDS = 3
 """Number of times that matches are found and cameras adjusted."""
 SAMPLES = 2000
 """About the number of pixels of each picture whose matches are used, on a grid."""
 FEWEST = 100
-"""Least number of points, per camera, to which cameras are adjusted."""
+"""Least number of points, per camera on average, to which cameras are adjusted."""
+LEAST_ANGLE = 0.5
+"""Least angle between the rays of a point, degrees."""
+HOLES = 1.5
+"""Largest distance, in pixels of the pictures that stereo compares, to a pixel that it matches. These pictures may be
+smaller than the views, of which it then matches every second or third pixel only."""
 MOST_CORRECTED, RETURNS = 0.008, 0.001
 """Largest correction by flow, and largest distance after the way forth and back, as shares of the longer side."""
 MOST_APART = 0.0125
 """Largest distance between a pixel and the image of its point before the adjustment, as a share of the longer side."""
 SAME_CELL = 1.0
 """Largest distance, in pixels, between the matches of the points within one pixel."""
-LOOSER, TOLERATED = 2.0, 1.0
+LOOSER, TOLERATED = 2.0, 0.5
 """Cameras are kept as they were if the median error of the features grows by this factor and beyond so many pixels."""
 
 
@@ -52,17 +58,24 @@ class _View(NamedTuple):
     """[H, W, 3] uint8 RGB."""
     still: np.ndarray
     """[H, W] bool, False where the picture may show a mover."""
-    maps: Maps
-    """Coordinates of the pixels in the recorded picture."""
+    recorded: RigCamera
+    """The camera with its distortion."""
+
+    def grid(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return rows and columns [S] of the pixels whose matches are used."""
+        height, width = self.still.shape
+        step = max(1, round(math.sqrt(width * height / SAMPLES)))
+        rows, columns = np.mgrid[step // 2 : height : step, step // 2 : width : step]
+        return rows.ravel(), columns.ravel()
 
 
 class _Match(NamedTuple):
-    """Where the pixels of one view are in another."""
+    """Where the pixels of a view's grid are in another."""
 
     targets: np.ndarray
-    """[H, W, 2] pixel positions; the centre of the first pixel is at (0, 0)."""
+    """[S, 2] pixel positions; the centre of the first pixel is at (0, 0)."""
     sure: np.ndarray
-    """[H, W] bool"""
+    """[S] bool"""
 
 
 class _Seen(NamedTuple):
@@ -73,44 +86,39 @@ class _Seen(NamedTuple):
     pixels: np.ndarray
 
 
-def adjusted(model: Any, stills: FrameFiles, done: Callable[[], object] = lambda: None) -> Any:
+def adjusted(model: Any, stills: FrameFiles, done: Callable[[int], object] = lambda _: None) -> Any:
     """Return a COLMAP reconstruction whose cameras and points are adjusted to dense matches.
 
     Args:
         model: reconstruction of the still pictures; it is not changed.
-        done: called after each of ``ROUNDS`` rounds.
+        done: called with numbers that add up to the number of pictures in each of ``ROUNDS`` rounds.
 
     Returns:
         The given one if too little matches, or if its features no longer fit.
     """
-    before, best = _features_error(model), model
+    before, best = median_error(copy.deepcopy(model)), model
     for _ in range(ROUNDS):
         views = _views(best, stills)
-        known = solution_of(best, stills.names).points
-        pairs = stereo_pairs({number: view.camera for number, view in views.items()}, known) if len(known) else {}
-        seen = _gathered(views, _matches(views, pairs))
+        pairs = stereo_pairs(
+            {number: view.camera for number, view in views.items()}, solution_of(best, stills.names).points
+        )
+        seen = _gathered(views, _matches(views, pairs, done))
         points, kept = _placed(views, seen)
         if kept.sum() < FEWEST * len(views):
-            return model
-        added = _added(best, stills.names, views, seen, points, kept)
-        dense = straightened(added)
+            break
+        dense = straightened(_added(best, stills.names, views, seen, points, kept))
         best = _without(dense, len(best.points3D))
-        done()
-    after = _features_error(best)
-    return model if after > max(LOOSER * before, TOLERATED) else best
+    after = median_error(copy.deepcopy(best))
+    return best if after <= max(LOOSER * before, TOLERATED) else model
 
 
-def adjust(folder: Path, stills: FrameFiles, target: Path, done: Callable[[], object] = lambda: None) -> None:
+def adjust(folder: Path, stills: FrameFiles, target: Path, done: Callable[[int], object] = lambda _: None) -> None:
     """Read the model in a folder, and write the adjusted one to another."""
     with quiet() as pycolmap:
         model = adjusted(pycolmap.Reconstruction(folder), stills, done)
         shutil.rmtree(target, ignore_errors=True)  # an interrupted attempt
         target.mkdir()
         model.write_binary(target)
-
-
-def _features_error(model: Any) -> float:
-    return median_error(copy.deepcopy(model))
 
 
 def _views(model: Any, stills: FrameFiles) -> dict[int, _View]:
@@ -125,23 +133,28 @@ def _views(model: Any, stills: FrameFiles) -> dict[int, _View]:
         K = [[pinhole.fx, 0.0, pinhole.cx], [0.0, pinhole.fy, pinhole.cy], [0.0, 0.0, 1.0]]
         lens = torch.tensor(K, dtype=torch.float64)
         camera = Camera(torch.from_numpy(solved[number].viewmat), lens, pinhole.width, pinhole.height)
-        views[number] = _View(camera, image, still, maps)
+        views[number] = _View(camera, image, still, solved[number])
     return views
 
 
-def _matches(views: Mapping[int, _View], pairs: Mapping[tuple[int, int], StereoPair]) -> dict[tuple[int, int], _Match]:
+def _matches(
+    views: Mapping[int, _View], pairs: Mapping[tuple[int, int], StereoPair], done: Callable[[int], object]
+) -> dict[tuple[int, int], _Match]:
     """Match the paired views in both directions."""
     found = {}
-    for (one, two), pair in pairs.items():
+    for index, ((one, two), pair) in enumerate(pairs.items()):
         points = pair.match((views[one].image, views[two].image), views[one].still)[0]
         for a, b in ((one, two), (two, one)):
-            found[a, b] = _corrected(views[a], views[b], *_by_stereo(views[a].camera, views[b].camera, points))
+            reach = HOLES * float(views[a].camera.K[0, 0]) / pair.focal
+            moves, known = _by_stereo(views[a].camera, views[b].camera, points, reach)
+            found[a, b] = _corrected(views[a], views[b], moves, known)
+        done(len(views) * (index + 1) // len(pairs) - len(views) * index // len(pairs))
     return found
 
 
-def _by_stereo(one: Camera, two: Camera, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the displacement [H, W, 2] of pixels to another view, and where points [P, 3] tell it, [H, W] bool.
-    Elsewhere it is that of the nearest such pixel."""
+def _by_stereo(one: Camera, two: Camera, points: np.ndarray, reach: float) -> tuple[np.ndarray, np.ndarray]:
+    """Return the displacement [H, W, 2] of pixels to another view, and where points [P, 3] within ``reach`` pixels tell
+    it, [H, W] bool. Beside the points it is that of the nearest."""
     width, height = one.width, one.height
     (here, depths), (there, other_depths) = (pixels_of(camera, points) for camera in (one, two))
     cells = np.round(np.nan_to_num(here, nan=-1.0, posinf=-1.0, neginf=-1.0)).clip(-1, max(width, height)).astype(int)
@@ -155,10 +168,10 @@ def _by_stereo(one: Camera, two: Camera, points: np.ndarray) -> tuple[np.ndarray
     if not known.any():
         return np.zeros((height, width, 2), np.float32), known
     unknown = (~known).astype(np.uint8)
-    labels = cv2.distanceTransformWithLabels(unknown, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)[1]
+    distances, labels = cv2.distanceTransformWithLabels(unknown, cv2.DIST_L2, 5, labelType=cv2.DIST_LABEL_PIXEL)
     source = np.zeros(labels.max() + 1, int)
     source[labels[known]] = np.flatnonzero(known)
-    return means[source[labels]].astype(np.float32), known
+    return means[source[labels]].astype(np.float32), distances <= reach
 
 
 def _corrected(one: _View, two: _View, moves: np.ndarray, known: np.ndarray) -> _Match:
@@ -176,23 +189,21 @@ def _corrected(one: _View, two: _View, moves: np.ndarray, known: np.ndarray) -> 
     sure &= at_targets(known.astype(np.float32), middle) > 0.99
     sure &= at_targets(two.still.astype(np.float32), targets) > 0.99
     sure &= (targets >= 0).all(2) & (targets <= [width - 1, height - 1]).all(2)
-    return _Match(targets, sure)
+    rows, columns = one.grid()
+    return _Match(targets[rows, columns], sure[rows, columns])
 
 
 def _gathered(views: Mapping[int, _View], matches: Mapping[tuple[int, int], _Match]) -> _Seen:
     """Gather the matches of the pixels of a grid in each view: a pixel and all its matches are one point."""
     parts, count = [_Seen(np.zeros(0, int), np.zeros(0, int), np.zeros((0, 2)))], 0
     for number, view in views.items():
-        own = {two: match for (one, two), match in matches.items() if one == number}
-        height, width = view.still.shape
-        step = max(1, round(math.sqrt(width * height / SAMPLES)))
-        rows, columns = (each.ravel() for each in np.mgrid[step // 2 : height : step, step // 2 : width : step])
+        rows, columns = view.grid()
         matched = np.zeros(len(rows), bool)
-        for two, match in own.items():
-            sure = match.sure[rows, columns]
-            at = match.targets[rows[sure], columns[sure]].astype(np.float64)
-            parts.append(_Seen(count + np.flatnonzero(sure), np.full(len(at), two), at))
-            matched |= sure
+        for (one, two), match in matches.items():
+            if one == number:
+                at = match.targets[match.sure].astype(np.float64)
+                parts.append(_Seen(count + np.flatnonzero(match.sure), np.full(len(at), two), at))
+                matched |= match.sure
         here = np.stack([columns, rows], 1)[matched].astype(np.float64)
         parts.append(_Seen(count + np.flatnonzero(matched), np.full(len(here), number), here))
         count += len(rows)
@@ -209,7 +220,7 @@ def _placed(views: Mapping[int, _View], seen: _Seen) -> tuple[np.ndarray, np.nda
         across = np.eye(3) - rays[:, :, None] * rays[:, None, :]
         np.add.at(sums, seen.points[own], across)
         np.add.at(targets, seen.points[own], across @ start)
-    usable = np.linalg.det(sums) > 1e-9
+    usable = np.linalg.det(sums) > 2.0 * math.sin(math.radians(LEAST_ANGLE)) ** 2
     sums[~usable] = np.eye(3)
     points = np.linalg.solve(sums, targets[..., None])[..., 0]
     for number, view in views.items():
@@ -252,10 +263,12 @@ def _added(
 def _recorded(views: Mapping[int, _View], seen: _Seen) -> np.ndarray:
     """Return the observations' pixels [O, 2] in the recorded pictures; the corner of the first is at (0, 0)."""
     pixels = np.zeros_like(seen.pixels)
-    for number, view in views.items():
-        own = seen.cameras == number
-        at = seen.pixels[own][None].astype(np.float32)
-        pixels[own] = np.stack([at_targets(plane, at)[0] for plane in view.maps], 1) + 0.5
+    with quiet() as pycolmap:
+        for number, view in views.items():
+            own = seen.cameras == number
+            flat = np.concatenate([seen.pixels[own] + 0.5, np.ones((int(own.sum()), 1))], 1)
+            rays = flat @ np.linalg.inv(view.camera.K.numpy()).T
+            pixels[own] = np.asarray(lens_of(pycolmap, view.recorded).img_from_cam(rays)).reshape(-1, 2)
     return pixels
 
 

@@ -90,6 +90,10 @@ def straightened(model: Any) -> Any:
     """Return a COLMAP reconstruction adjusted anew, with lenses without distortion if these fit almost as well."""
     if not model.points3D:
         return model
+    if not any(len(lens.extra_params_idxs()) for lens in model.cameras.values()):
+        straight = copy.deepcopy(model)
+        _adjusted(straight, False)
+        return straight
     bent, straight = copy.deepcopy(model), copy.deepcopy(model)
     for lens in straight.cameras.values():
         params = np.array(lens.params)

@@ -33,10 +33,10 @@ class TimeLine:
     moments: np.ndarray
     """[C, T] second at which that frame was taken."""
 
-    @property
-    def times(self) -> np.ndarray:
-        """[C, T] moments scaled to go from 0 at the first of all cameras to 1 at the last."""
-        first, last = float(self.moments.min()), float(self.moments.max())
+    def times(self, cameras: Sequence[int]) -> np.ndarray:
+        """Return the moments [C, T], scaled to go from 0 at the first of the given cameras to 1 at their last."""
+        used = self.moments[list(cameras)]
+        first, last = float(used.min()), float(used.max())
         return (self.moments - first) / max(last - first, 1e-9)
 
 

@@ -257,7 +257,7 @@ class _Rig:
             bar.advance()
         # Captures that earlier versions finished have no adjusted cameras.
         if model.is_dir() and (self.journal.knows("adjustment") or not self.journal.finished):
-            with self.show(adjustment.ROUNDS, "adjusting cameras") as bar:
+            with self.show(adjustment.ROUNDS * count, "adjusting cameras") as bar:
                 self.journal.stage(
                     "adjustment",
                     None,

@@ -74,7 +74,7 @@ def write_rig(
     viewmats = np.stack([camera.viewmat for camera in solved.cameras.values()])
     moved = upright(viewmats, all_points)
     turned = dict(zip(solved.cameras, moved.viewmats(viewmats)))
-    instants, times = len(line.seconds), line.times
+    instants, times = len(line.seconds), line.times(list(solved.cameras))
     frames, splits = [], {"train": [], "test": []}
     with show(len(solved.cameras) * instants, "undistorting") as bar:
         for number, (p, (x, y)) in pinholes.items():

@@ -10,6 +10,7 @@ from helpers import textured_corner as corner
 from scgs_warp.capture.features import quiet
 from scgs_warp.capture.rig import adjustment
 from scgs_warp.capture.rig.cameras import median_error, read_solution, solution_of
+from scgs_warp.geometry import stereo
 from scgs_warp.geometry.view_rays import pixels_of
 
 LENSES = {"straight": 0.0, "bent": -0.12}
@@ -26,16 +27,36 @@ def test_cameras_become_exact(rig):
     true, files, model = rig
     rounds = []
     before = solution_of(model, files.names)
-    after = solution_of(adjustment.adjusted(model, files, lambda: rounds.append(1)), files.names)
+    after = solution_of(adjustment.adjusted(model, files, rounds.append), files.names)
     loose, exact = (corner.misplaced(each.cameras, true) for each in (before, after))
     assert loose > 0.5 and exact < 0.12, (loose, exact)
     assert after.cameras[0].params[0] == pytest.approx(corner.FOCAL, rel=0.005)
     assert after.cameras[0].params[3] == pytest.approx(true[0].params[3], abs=0.01)
-    assert len(rounds) == adjustment.ROUNDS
+    assert sum(rounds) == adjustment.ROUNDS * len(true)
     assert len(after.points) == len(before.points), "points stay those of the features"
     assert (after.colors == before.colors).all() and len(set(after.colors[:, 0].tolist())) == len(after.colors)
     again = solution_of(model, files.names)
     assert (again.points == before.points).all() and again.cameras[1].params == before.cameras[1].params
+
+
+def test_stereo_of_reduced_pictures_leaves_no_holes(tmp_path, monkeypatch):
+    """Wide pictures and many disparities are compared at a smaller size, which matches every second pixel only."""
+    monkeypatch.setattr(stereo, "LARGEST_SIDE", 0.55 * corner.WIDTH)
+    true = corner.true_cameras(angles=corner.ANGLES[1:4])
+    files = corner.stills(tmp_path, true)
+    found = adjustment.adjusted(corner.model_of(true, files.names), files)
+    assert corner.misplaced(solution_of(found, files.names).cameras, true) < 0.15
+
+
+def test_cameras_with_lenses_of_their_own(tmp_path, monkeypatch):
+    monkeypatch.setattr(adjustment, "ROUNDS", 2)
+    true = corner.true_cameras(angles=corner.ANGLES[1:4])
+    files = corner.stills(tmp_path, true)
+    found = adjustment.adjusted(corner.model_of(true, files.names, shared=False), files)
+    cameras = solution_of(found, files.names).cameras
+    assert len({camera.params[0] for camera in cameras.values()}) == 3
+    assert [camera.params[0] for camera in cameras.values()] == pytest.approx([corner.FOCAL] * 3, rel=0.02)
+    assert corner.misplaced(cameras, true) < 0.2
 
 
 def test_exact_features_still_fit(tmp_path):
