@@ -21,6 +21,7 @@ from . import features, mapping, moving, picking, pictures, writing
 from .diagnosis import Outcome, notes, too_few
 from .features import CameraModel, FrameFiles, Matching
 from .journal import Journal
+from .limits import check_limits
 from .source import Source, SourceFrame, open_source, read_rgb
 
 MAX_SECONDS = 1e9
@@ -101,19 +102,10 @@ def check(request: CaptureRequest) -> None:
     """
     if request.frames is not None and request.frames < MIN_FRAMES:
         raise UserError(f"--frames {request.frames}: give at least {MIN_FRAMES}")
-    if not 64 <= request.size <= 8192:
-        raise UserError(f"--size {request.size}: give 64 to 8192 pixels")
-    if request.fov is not None and not 5.0 <= request.fov <= 170.0:
-        raise UserError(f"--fov {request.fov:g}: give 5 to 170 degrees")
-    if not 64 <= request.features <= 32768:
-        raise UserError(f"--features {request.features}: give 64 to 32768")
-    if not 0.0 <= request.least <= 1.0:
-        raise UserError(f"--least {request.least:g}: give a share from 0 to 1")
+    check_limits(request)
     start, end = request.start or 0.0, math.inf if request.end is None else request.end
     if not 0.0 <= start < end:
         raise UserError(f"--start {start:g} --end {end:g}: give two seconds of the video, the earlier one as --start")
-    if not 0 <= request.seed < 2**31:
-        raise UserError(f"--seed {request.seed}: give 0 or more")
     if request.keep == "moving" and request.masks in ("auto", "none"):
         raise UserError(
             "--keep-static off: needs masks of the whole mover, black where it is; give --masks DIR or --masks "

@@ -10,6 +10,7 @@ from typing import Literal
 from ...data.natural_order import natural
 from ...errors import UserError
 from ..features import CameraModel
+from ..limits import check_limits
 
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".mkv", ".avi", ".webm")
 FEWEST_CAMERAS = 2
@@ -73,19 +74,10 @@ def check(request: RigRequest, names: list[str]) -> None:
     """
     if request.frames is not None and request.frames < 6:
         raise UserError(f"--frames {request.frames}: give at least 6")
-    if not 64 <= request.size <= 8192:
-        raise UserError(f"--size {request.size}: give 64 to 8192 pixels")
-    if request.fov is not None and not 5.0 <= request.fov <= 170.0:
-        raise UserError(f"--fov {request.fov:g}: give 5 to 170 degrees")
-    if not 64 <= request.features <= 32768:
-        raise UserError(f"--features {request.features}: give 64 to 32768")
-    if not 0.0 <= request.least <= 1.0:
-        raise UserError(f"--least {request.least:g}: give a share from 0 to 1")
+    check_limits(request)
     begin, end = request.start or 0.0, math.inf if request.end is None else request.end
     if not 0.0 <= begin < end:
         raise UserError(f"--start {begin:g} --end {end:g}: give two seconds of the common time, the earlier one first")
-    if not 0 <= request.seed < 2**31:
-        raise UserError(f"--seed {request.seed}: give 0 or more")
     if request.offsets is not None:
         if len(request.offsets) not in (1, len(names)):
             raise UserError(
