@@ -18,8 +18,11 @@ WALL, FLOOR = 5.0, 1.2
 """Depth of the wall and height of the floor below the cameras; y points down."""
 
 
-def true_cameras(distortion: float = 0.0, angles=ANGLES) -> dict[int, RigCamera]:
-    """Cameras on an arc about a point before the wall."""
+def true_cameras(
+    distortion: float = 0.0, angles=ANGLES, lens: tuple[str, tuple[float, ...]] | None = None
+) -> dict[int, RigCamera]:
+    """Cameras on an arc about a point before the wall; ``lens`` is a model of COLMAP with its parameters."""
+    model, params = lens or ("SIMPLE_RADIAL", (FOCAL, WIDTH / 2, HEIGHT / 2, distortion))
     cameras = {}
     for number, angle in enumerate(angles):
         turn = np.radians(angle)
@@ -27,21 +30,20 @@ def true_cameras(distortion: float = 0.0, angles=ANGLES) -> dict[int, RigCamera]
         centre = np.array([0.0, 0.0, 4.0]) + rotation.T @ [0.0, 0.1 * (number % 2), -4.0]
         viewmat = np.eye(4)
         viewmat[:3, :3], viewmat[:3, 3] = rotation, -rotation @ centre
-        params = (FOCAL, WIDTH / 2, HEIGHT / 2, distortion)
-        cameras[number] = RigCamera("SIMPLE_RADIAL", params, WIDTH, HEIGHT, viewmat)
+        cameras[number] = RigCamera(model, params, WIDTH, HEIGHT, viewmat)
     return cameras
 
 
 def surface(camera: RigCamera) -> np.ndarray:
     """Return the points [H, W, 3] that the pixels show."""
-    columns, rows = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
+    columns, rows = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
     with quiet() as pycolmap:
         flat = np.asarray(lens_of(pycolmap, camera).cam_from_img(np.stack([columns, rows], 2).reshape(-1, 2)))
     rays = np.concatenate([flat, np.ones((len(flat), 1))], 1) @ camera.viewmat[:3, :3]
     centre = -camera.viewmat[:3, :3].T @ camera.viewmat[:3, 3]
     to_wall = (WALL - centre[2]) / rays[:, 2]
     to_floor = np.where(rays[:, 1] > 1e-6, (FLOOR - centre[1]) / np.maximum(rays[:, 1], 1e-6), np.inf)
-    return (centre + rays * np.minimum(to_wall, to_floor)[:, None]).reshape(HEIGHT, WIDTH, 3)
+    return (centre + rays * np.minimum(to_wall, to_floor)[:, None]).reshape(camera.height, camera.width, 3)
 
 
 def picture(camera: RigCamera) -> np.ndarray:
@@ -70,7 +72,7 @@ def stills(folder: Path, cameras: dict[int, RigCamera], masks: dict[int, np.ndar
     names = [f"cam{number}.png" for number in cameras]
     for name, (number, camera) in zip(names, cameras.items()):
         write_png(folder / "stills" / name, picture(camera))
-        mask = np.full((HEIGHT, WIDTH), 255, np.uint8) if masks is None else masks[number]
+        mask = np.full((camera.height, camera.width), 255, np.uint8) if masks is None else masks[number]
         write_png(folder / "masks" / name, np.repeat(mask[..., None], 3, 2))
     return FrameFiles(folder / "stills", names, folder / "masks")
 
@@ -112,7 +114,8 @@ def misplaced(found: dict[int, RigCamera], true: dict[int, RigCamera]) -> float:
     for number in list(true)[1:-1]:
         points = surface(true[number])[8::16, 8::16].reshape(-1, 3)
         seen = {each: project(true[each], points) for each in (number - 1, number, number + 1)}
-        usable = np.logical_and.reduce([(p >= 0).all(1) & (p <= [WIDTH, HEIGHT]).all(1) for p in seen.values()])
+        sizes = {each: (true[each].width, true[each].height) for each in seen}
+        usable = np.logical_and.reduce([(p >= 0).all(1) & (p <= sizes[each]).all(1) for each, p in seen.items()])
         with quiet() as pycolmap:
             sides = [
                 np.asarray(lens_of(pycolmap, found[each]).cam_from_img(seen[each][usable])).T

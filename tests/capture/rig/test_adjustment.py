@@ -59,6 +59,36 @@ def test_cameras_with_lenses_of_their_own(tmp_path, monkeypatch):
     assert corner.misplaced(cameras, true) < 0.2
 
 
+MIDDLE = (corner.WIDTH / 2, corner.HEIGHT / 2)
+MODELS = {
+    "SIMPLE_PINHOLE": (corner.FOCAL, *MIDDLE),
+    "PINHOLE": (corner.FOCAL, 1.1 * corner.FOCAL, *MIDDLE),
+    "RADIAL": (corner.FOCAL, *MIDDLE, -0.12, 0.03),
+    "OPENCV": (corner.FOCAL, 1.1 * corner.FOCAL, *MIDDLE, -0.12, 0.03, 0.004, -0.004),
+    "OPENCV_FISHEYE": (corner.FOCAL, 1.1 * corner.FOCAL, *MIDDLE, 0.05, 0.01, 0.0, 0.0),
+}
+
+
+@pytest.mark.parametrize("model", MODELS)
+def test_lenses_of_all_models(tmp_path, model):
+    true = corner.true_cameras(lens=(model, MODELS[model]))
+    files = corner.stills(tmp_path, true)
+    found = solution_of(adjustment.adjusted(corner.model_of(true, files.names), files), files.names)
+    assert {camera.model for camera in found.cameras.values()} == {model}
+    assert corner.misplaced(found.cameras, true) < 0.15
+
+
+def test_pictures_of_different_sizes(tmp_path):
+    """Cameras of two kinds: the wide one's pictures are cut to the size of the others'."""
+    true = corner.true_cameras(angles=corner.ANGLES[1:4])
+    width, height = corner.WIDTH + 64, corner.HEIGHT + 30
+    lens = (0.9 * corner.FOCAL, width / 2, height / 2, -0.1)
+    true[1] = true[1]._replace(params=lens, width=width, height=height)
+    files = corner.stills(tmp_path, true)
+    found = adjustment.adjusted(corner.model_of(true, files.names, shared=False), files)
+    assert corner.misplaced(solution_of(found, files.names).cameras, true) < 0.2
+
+
 def test_exact_features_still_fit(tmp_path):
     """Dense matches have the features' convention of pixels."""
     true = corner.true_cameras()
