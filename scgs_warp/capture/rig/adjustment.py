@@ -112,13 +112,15 @@ def adjusted(model: Any, stills: FrameFiles, done: Callable[[int], object] = lam
     return best if after <= max(LOOSER * before, TOLERATED) else model
 
 
-def adjust(folder: Path, stills: FrameFiles, target: Path, done: Callable[[int], object] = lambda _: None) -> None:
-    """Read the model in a folder, and write the adjusted one to another."""
+def adjust(folder: Path, stills: FrameFiles, target: Path, done: Callable[[int], object] = lambda _: None) -> bool:
+    """Read the model in a folder, and write the adjusted one to another. Return False if it stays as it was."""
     with quiet() as pycolmap:
-        model = adjusted(pycolmap.Reconstruction(folder), stills, done)
+        before = pycolmap.Reconstruction(folder)
+        model = adjusted(before, stills, done)
         shutil.rmtree(target, ignore_errors=True)  # an interrupted attempt
         target.mkdir()
         model.write_binary(target)
+    return model is not before
 
 
 def _views(model: Any, stills: FrameFiles) -> dict[int, _View]:

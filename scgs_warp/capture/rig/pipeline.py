@@ -84,7 +84,7 @@ def capture_rig(request: RigRequest, folder: Path, *, device: str = "cpu", show:
         raise UserError(f"--held-out {held_out}: its pose was not found; hold out another camera")
     lines = [rig.describe(line), rig.describe_clock(starts)]
     lines += [f"note: {', '.join(missing)} shares too little with the others and is left out"] if missing else []
-    lines += rig.unsteady()
+    lines += [*rig.unadjusted(), *rig.unsteady()]
     if not before:
         extra = rig.points(solved.cameras)
         scene = write_rig(folder, solved, extra, names, line, held_out, rig.picture, show)
@@ -314,6 +314,12 @@ class _Rig:
         return (
             f"{len(self.names)} cameras, {len(line.seconds)} instants within {length:.2f} s that all of them recorded"
         )
+
+    def unadjusted(self) -> list[str]:
+        """Say if the still pictures did not match well enough to adjust the cameras."""
+        if not self.journal.knows("adjustment") or self.journal.result("adjustment") is not False:
+            return []
+        return ["note: still pictures match too little to adjust the cameras, which stay as their features place them"]
 
     def unsteady(self) -> list[str]:
         """Name the cameras that do not stand still."""

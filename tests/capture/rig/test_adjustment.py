@@ -117,7 +117,7 @@ def test_the_same_bits_again_and_from_a_folder(rig, tmp_path, monkeypatch):
     with quiet():
         (tmp_path / "model").mkdir()
         model.write_binary(tmp_path / "model")
-    adjustment.adjust(tmp_path / "model", files, tmp_path / "one")
+    assert adjustment.adjust(tmp_path / "model", files, tmp_path / "one")
     (tmp_path / "two").mkdir()
     (tmp_path / "two/points3D.bin").write_bytes(b"of an interrupted attempt")
     adjustment.adjust(tmp_path / "model", files, tmp_path / "two")
@@ -160,3 +160,9 @@ def test_cameras_stay_as_they_are(tmp_path, monkeypatch, lack):
         monkeypatch.setattr(adjustment, "TOLERATED", 0.0)
     model = corner.model_of(true, files.names)
     assert adjustment.adjusted(model, files) is model
+    if lack == "texture":
+        with quiet():
+            (tmp_path / "model").mkdir()
+            model.write_binary(tmp_path / "model")
+        assert not adjustment.adjust(tmp_path / "model", files, tmp_path / "same")
+        assert (tmp_path / "same/images.bin").read_bytes() == (tmp_path / "model/images.bin").read_bytes()

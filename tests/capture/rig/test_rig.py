@@ -122,6 +122,17 @@ def test_a_capture_that_an_earlier_version_finished_is_left_alone(films, capture
     assert not (old / "work/adjusted").exists()
 
 
+def test_cameras_that_are_not_adjusted_are_named(films, captured, tmp_path):
+    assert not any("adjust" in line for line in run(films.folder, captured).lines)
+    other = tmp_path / "other"
+    shutil.copytree(captured, other)
+    journal = json.loads((other / "work/journal.json").read_text())
+    assert journal["stages"]["adjustment"]["result"] is True
+    journal["stages"]["adjustment"]["result"] = False
+    (other / "work/journal.json").write_text(json.dumps(journal))
+    assert any(line.startswith("note: ") and "adjust" in line for line in run(films.folder, other).lines)
+
+
 def test_videos_of_neural_3d_video_are_unpacked(films, tmp_path, capsys):
     """With cameras of their own, all begin at once; the reader loads what comes of it, with points."""
     source = tmp_path / "scene"
