@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 import torch
@@ -17,6 +18,7 @@ from ..data.dataset import Dataset, spread
 from ..geometry.normalisation import FEWEST_POINTS, Normalisation
 from ..types import Frame
 from .silhouettes import is_in_parts, is_thin
+from .standing_cameras import standing_groups
 
 MOST_PAIRS = 12
 FEWEST_PAIRS = 6
@@ -86,6 +88,8 @@ class Survey:
     """True if the content lies behind most cameras."""
     depth_maps: int = 0
     """Number of frames with a depth map."""
+    standing: int = 0
+    """Number of cameras, if all frames are of several that stand still."""
 
 
 def survey(data: Dataset) -> Survey:
@@ -99,6 +103,8 @@ def survey(data: Dataset) -> Survey:
     near = directions[order]
     following = np.degrees(np.arccos(np.clip(np.einsum("vi,vi->v", near[1:], near[:-1]), -1, 1)))
     some = directions[spread(len(directions), 400)]
+    groups = standing_groups(data, data.cameras)
+    close = [(int(order[i]), int(order[i + 1])) for i in np.flatnonzero(following < SAME_PLACE)]
     first = data.entries[0].camera
     return Survey(
         frames=len(data),
@@ -113,11 +119,12 @@ def survey(data: Dataset) -> Survey:
         cut_out=bool(data.with_alpha),
         thin=is_thin(data),
         in_parts=is_in_parts(data),
-        flicker=_flicker(data, [(int(order[i]), int(order[i + 1])) for i in np.flatnonzero(following < SAME_PLACE)]),
+        flicker=_flicker(data, [pair for group in groups for pair in pairwise(group)] or close),
         points=0 if data.points is None else len(data.points),
         sweep=_sweep(near, times[order]),
         look_away=looks_away(data),
         depth_maps=len(data.with_depth),
+        standing=len(groups),
     )
 
 
@@ -183,11 +190,11 @@ def _brightness(frame: Frame, on_white: bool) -> float:
 
 def advise(facts: Survey, config: TrainConfig, device: str = "cpu") -> tuple[str, str]:
     """Write two lines: the data's properties; the expected result and the most useful setting."""
-    cameras = (
-        f"{facts.views} views of each instant"
-        if facts.views > 1
-        else f"one camera, {facts.turn:.0f} degrees from frame to frame"
-    )
+    cameras = f"one camera, {facts.turn:.0f} degrees from frame to frame"
+    if facts.views > 1:
+        cameras = f"{facts.views} views of each instant"
+    elif facts.standing:
+        cameras = f"{facts.standing} cameras that stand still"
     points = f"{facts.points:,} points" if facts.points else "no points"
     points += f", {facts.depth_maps:,} depth maps" if facts.depth_maps else ""
     first = (
@@ -221,7 +228,7 @@ def _expectation(facts: Survey, compares_depth: bool) -> str:
         return f"guessed motion from time {facts.gap[0]:.2f} to {facts.gap[1]:.2f}, where there is no frame"
     if facts.flicker > UNSTEADY:
         return f"averaged colours: brightness changes by {100 * facts.flicker:.0f} % from frame to frame (exposure)"
-    if facts.views > 1:
+    if facts.views > 1 or facts.standing:
         return "good views between the cameras at all times: each instant is seen from several sides"
     if facts.turn > JUMPS:
         return "good views from all around: the camera stands elsewhere at each instant"
@@ -277,6 +284,6 @@ def _help(facts: Survey, config: TrainConfig, device: str) -> str:
         )
     if facts.points < FEWEST_POINTS and not facts.cut_out:
         return "COLMAP's points (ply_file_path, or its sparse model) begin some 2 dB better than random ones"
-    if not facts.cut_out and facts.views == 1 and config.optim.cameras == 0.0:
+    if not facts.cut_out and facts.views == 1 and not facts.standing and config.optim.cameras == 0.0:
         return "if the poses are off by more than a pixel, --set optim.cameras=2e-4 corrects them"
     return "the settings fit"

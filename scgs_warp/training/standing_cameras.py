@@ -89,15 +89,12 @@ def reduced(frame: Frame) -> tuple[np.ndarray, np.ndarray]:
     return shown, cv2.resize(valid.astype(np.uint8), size, interpolation=cv2.INTER_NEAREST).astype(bool)
 
 
-def standing_cameras(data: Dataset, views: list[Camera]) -> list[StandingCamera]:
-    """Find the cameras that stand still.
+def standing_groups(data: Dataset, views: list[Camera]) -> list[list[int]]:
+    """Return the indices of each standing camera's frames in order of time, the cameras in the order of their first
+    frames; none unless all frames are of cameras that stand, at least two of them.
 
     Args:
         views: the cameras of the frames, in any frame of reference, on the host.
-
-    Returns:
-        The cameras in the order of their first frames; none of them unless all frames are of cameras that stand, at
-        least two of them.
     """
     groups: dict[tuple, list[int]] = defaultdict(list)
     for index, view in enumerate(views):
@@ -105,10 +102,17 @@ def standing_cameras(data: Dataset, views: list[Camera]) -> list[StandingCamera]
         groups[(*(round(value, 5) for value in numbers), view.width, view.height)].append(index)
     if len(groups) < 2 or min(map(len, groups.values())) < LEAST_MOMENTS:
         return []
+    return [sorted(indices, key=lambda index: data.entries[index].time) for indices in groups.values()]
+
+
+def standing_cameras(data: Dataset, views: list[Camera]) -> list[StandingCamera]:
+    """Find the cameras that stand still, and what moves before them (:func:`standing_groups`)."""
+    groups = standing_groups(data, views)
+    if not groups:
+        return []
     standing = []
     with progress(len(groups), "looking for what moves") as bar:
-        for indices in groups.values():
-            indices.sort(key=lambda index: data.entries[index].time)
+        for indices in groups:
             still, moves = _still_and_moving(data, [indices[each] for each in spread(len(indices), MOST_MOMENTS)])
             times = np.array([data.entries[index].time for index in indices])
             standing.append(StandingCamera(views[indices[0]], indices, still, moves, float(np.median(np.diff(times)))))

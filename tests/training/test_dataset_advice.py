@@ -69,6 +69,31 @@ def test_depth_maps_tell_what_one_camera_cannot():
             assert "as good as the depth maps" not in lines(unlike, **changes)[1]
 
 
+def rig(own_moments: float = 0.0, flicker: float = 0.0, moments: int = 8) -> Dataset:
+    """Three cameras that stand 4 degrees apart, each darker than the one before."""
+    frames = []
+    for number in range(3):
+        first = handheld(3, 4.0)[number]
+        for moment in range(moments):
+            light = (1.0 - 0.2 * number) * (1.0 - flicker * (moment % 2))
+            time = (moment + own_moments * number) / moments
+            frames.append(dataclasses.replace(first, time=time, image=first.image * light))
+    return Dataset(frames, folder=Path("rig"), split="train")
+
+
+@pytest.mark.parametrize("own_moments", [0.0, 0.2])
+def test_a_rig(own_moments):
+    """Cameras that are not locked have no instant in common; they differ in brightness, but none of them flickers."""
+    data = rig(own_moments)
+    assert survey(data).standing == 3 and survey(data).flicker == 0
+    first, second = lines(data)
+    assert ("3 cameras that stand still" if own_moments else "3 views of each instant") in first
+    assert "one camera" not in first and "degrees from frame to frame" not in first
+    assert "seen from several sides" in second and "line of sight" not in second and "optim.cameras" not in second
+    assert survey(rig(own_moments, flicker=0.2)).flicker == pytest.approx(0.25, abs=0.01)
+    assert survey(handheld(41, 2.0)).standing == 0 and survey(rig(own_moments, moments=3)).standing == 0
+
+
 def test_exposure():
     assert "brightness changes by 20 %" in lines(handheld(exposure=0.2))[1]
     assert "brightness" not in lines(handheld(exposure=0.04))[1]
