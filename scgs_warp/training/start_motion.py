@@ -24,9 +24,9 @@ from ..seeding import generator
 from .flow_points import InstantPoints
 from .tracks import Tracks
 
-STEPS, STEPS_TRACKED = 600, 250
-"""Number of steps without tracks, and with tracks per cloud: tracks lead farther, and are exact enough to be followed
-closely."""
+STEPS, STEPS_TRACKED, STEPS_PER_CLOUD = 600, 1500, 250
+"""Number of steps without tracks, least number with tracks, and number of these per cloud: tracks lead farther, and are
+exact enough to be followed closely."""
 POINTS, RESTING = 1500, 600
 """Largest numbers of moving points of a cloud, and of resting points."""
 RATE, RATE_END = 1e-3, 1e-4
@@ -80,7 +80,7 @@ def learn_motion(motion: ControlPoints, seen: SeenMotion, resting: Tensor, confi
     network = dict(motion.network.named_parameters())
     optimizer = Adam(network, dict.fromkeys(network, RATE))
     draws = generator(config.seed, 52)
-    steps = STEPS if tracks is None else max(STEPS, STEPS_TRACKED * len(clouds))
+    steps = STEPS if tracks is None else max(STEPS_TRACKED, STEPS_PER_CLOUD * len(clouds))
     with progress(steps, "motion of what moves") as bar:
         for step in range(steps):
             for group in optimizer.groups.values():

@@ -8,6 +8,7 @@ import pytest
 import torch
 
 from helpers.tiny import tiny_config
+from scgs_warp.training import start_motion
 from scgs_warp.training.flow_points import InstantPoints
 from scgs_warp.training.pretrain import initial_motion
 from scgs_warp.training.start_motion import SeenMotion, _carried, _Target, learn_motion, start_cloud
@@ -140,3 +141,25 @@ def test_tracks_show_what_nearest_points_cannot():
         errors[name] = float(torch.stack(apart).mean())
     still = float(torch.stack([(disc - turned(disc, time)).norm(dim=1).mean() for time in times]).mean())
     assert errors["tracks"] < 0.15 * still < 0.5 * still < errors["nearest"]
+
+
+@pytest.mark.parametrize(("moments", "tracked", "steps"), [(3, False, 600), (3, True, 1500), (24, True, 6000)])
+def test_each_moment_has_its_steps(monkeypatch, moments, tracked, steps):
+    at = [turned(arm(), moment / (moments - 1)) for moment in range(moments)]
+    seen = []
+    for moment, (points, later) in enumerate(zip(at, [*at[1:], None])):
+        time = moment / (moments - 1)
+        seen.append(InstantPoints(points, colors_of(arm()), torch.ones(500) > 0, time, later if tracked else None))
+
+    class Begun(Exception):
+        pass
+
+    def begin(total: int, text: str):
+        raise Begun(total)
+
+    monkeypatch.setattr(start_motion, "progress", begin)
+    config = tiny_config(40, motion={"nodes": 12})
+    motion = initial_motion(config, arm(), moves=torch.ones(500) > 0)
+    with pytest.raises(Begun) as begun:
+        learn_motion(motion, seen_in(seen), wall(), config)
+    assert begun.value.args == (steps,)
