@@ -18,7 +18,7 @@ from ..data.dataset import Dataset, spread
 from ..geometry.normalisation import FEWEST_POINTS, Normalisation
 from ..types import Frame
 from .silhouettes import is_in_parts, is_thin
-from .standing_cameras import standing_groups
+from .standing_cameras import LATE, standing_groups
 
 MOST_PAIRS = 12
 FEWEST_PAIRS = 6
@@ -70,7 +70,7 @@ class Survey:
     gap: tuple[float, float]
     """Beginning and end of the longest interval without a frame."""
     typical_gap: float
-    """Median interval between neighbouring instants."""
+    """Median interval between neighbouring instants, of one camera if several stand still."""
     cut_out: bool
     """True where alpha separates objects from the background."""
     thin: bool
@@ -79,7 +79,7 @@ class Survey:
     """True if the subject consists of separate parts (:func:`silhouettes.is_in_parts`)."""
     flicker: float
     """Relative change of brightness between successive frames (the ninth decile), measured where the camera hardly
-    moves."""
+    moves; of cameras that stand still, between frames of one camera."""
     points: int
     """Number of initial points in the data."""
     sweep: float = 180.0
@@ -89,7 +89,7 @@ class Survey:
     depth_maps: int = 0
     """Number of frames with a depth map."""
     standing: int = 0
-    """Number of cameras, if all frames are of several that stand still."""
+    """Number of cameras, if all frames are of several that stand still and record at the same time."""
 
 
 def survey(data: Dataset) -> Survey:
@@ -98,12 +98,16 @@ def survey(data: Dataset) -> Survey:
     instants, counts = np.unique(times, return_counts=True)
     steps = np.diff(instants)
     widest = int(steps.argmax()) if len(steps) else 0
-    directions = _directions(data)
+    normalisation = Normalisation.fit(data.cameras, data.points)
+    directions = _directions(data, normalisation)
     order = np.argsort(times, kind="stable")
     near = directions[order]
     following = np.degrees(np.arccos(np.clip(np.einsum("vi,vi->v", near[1:], near[:-1]), -1, 1)))
     some = directions[spread(len(directions), 400)]
-    groups = standing_groups(data, data.cameras)
+    groups = standing_groups(data, [normalisation.apply_camera(camera) for camera in data.cameras])
+    if groups and not _together([times[group] for group in groups]):
+        groups = []
+    own_steps = np.concatenate([np.diff(times[group]) for group in groups]) if groups else steps
     close = [(int(order[i]), int(order[i + 1])) for i in np.flatnonzero(following < SAME_PLACE)]
     first = data.entries[0].camera
     return Survey(
@@ -115,7 +119,7 @@ def survey(data: Dataset) -> Survey:
         arc=float(np.degrees(np.arccos(np.clip((some @ some.T).min(), -1, 1)))),
         turn=float(np.median(following)) if len(following) else 0.0,
         gap=(float(instants[widest]), float(instants[widest + 1])) if len(steps) else (0.0, 0.0),
-        typical_gap=float(np.median(steps)) if len(steps) else 0.0,
+        typical_gap=float(np.median(own_steps)) if len(own_steps) else 0.0,
         cut_out=bool(data.with_alpha),
         thin=is_thin(data),
         in_parts=is_in_parts(data),
@@ -157,9 +161,20 @@ def looks_away(data: Dataset) -> bool:
     return bool((depths < 0).all())
 
 
-def _directions(data: Dataset) -> np.ndarray:
+def _together(times: list[np.ndarray]) -> bool:
+    """Return whether most frames of each camera have one of another camera at about the same time."""
+    reach = LATE * float(np.median(np.concatenate([np.diff(own) for own in times])))
+    close = []
+    for number, own in enumerate(times):
+        others = np.sort(np.concatenate([each for other, each in enumerate(times) if other != number]))
+        after = np.searchsorted(others, own).clip(1, len(others) - 1)
+        close.append(np.minimum(np.abs(own - others[after - 1]), np.abs(own - others[after])) <= reach)
+    return bool(np.concatenate(close).mean() > 0.5)
+
+
+def _directions(data: Dataset, normalisation: Normalisation) -> np.ndarray:
     """Return the unit vectors [V, 3] from the centre of the scene to the cameras."""
-    centre = Normalisation.fit(data.cameras, data.points).centre
+    centre = normalisation.centre
     offsets = np.stack([camera.position.double().cpu().numpy() for camera in data.cameras]) - centre
     return offsets / np.maximum(np.linalg.norm(offsets, axis=1, keepdims=True), 1e-12)
 
@@ -191,7 +206,8 @@ def _brightness(frame: Frame, on_white: bool) -> float:
 def advise(facts: Survey, config: TrainConfig, device: str = "cpu") -> tuple[str, str]:
     """Write two lines: the data's properties; the expected result and the most useful setting."""
     cameras = f"one camera, {facts.turn:.0f} degrees from frame to frame"
-    if facts.views > 1:
+    locked = facts.frames == facts.views * facts.instants
+    if facts.views > 1 and (locked or not facts.standing):
         cameras = f"{facts.views} views of each instant"
     elif facts.standing:
         cameras = f"{facts.standing} cameras that stand still"

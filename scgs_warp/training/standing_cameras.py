@@ -94,7 +94,7 @@ def standing_groups(data: Dataset, views: list[Camera]) -> list[list[int]]:
     frames; none unless all frames are of cameras that stand, at least two of them.
 
     Args:
-        views: the cameras of the frames, in any frame of reference, on the host.
+        views: the cameras of the frames, normalised, on the host.
     """
     groups: dict[tuple, list[int]] = defaultdict(list)
     for index, view in enumerate(views):

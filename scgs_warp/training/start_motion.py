@@ -24,9 +24,11 @@ from ..seeding import generator
 from .flow_points import InstantPoints
 from .tracks import Tracks
 
-STEPS, STEPS_TRACKED, STEPS_PER_CLOUD = 600, 1500, 250
-"""Number of steps without tracks, least number with tracks, and number of these per cloud: tracks lead farther, and are
-exact enough to be followed closely."""
+STEPS = 600
+"""Number of steps without tracks."""
+STEPS_TRACKED, STEPS_PER_CLOUD = 1500, 250
+"""With tracks: least number of steps, and number of steps for each cloud. Tracks lead farther than nearest points, and
+are exact enough to be followed closely."""
 POINTS, RESTING = 1500, 600
 """Largest numbers of moving points of a cloud, and of resting points."""
 RATE, RATE_END = 1e-3, 1e-4

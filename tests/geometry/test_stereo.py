@@ -17,7 +17,7 @@ ALL = np.ones((corner.HEIGHT, corner.WIDTH), bool)
 
 def sampled(picture: np.ndarray, pixels: np.ndarray, interpolation: int) -> np.ndarray:
     """Return the values [P, C] of a picture [H, W, C] at pixels [P, 2]; the centre of the first is at (0, 0)."""
-    parts = np.array_split(pixels.astype(np.float32), max(1, len(pixels) // 30_000 + 1))  # OpenCV's largest side
+    parts = np.array_split(pixels.astype(np.float32), len(pixels) // 30_000 + 1)  # OpenCV's largest side
     values = [
         cv2.remap(picture, x[:, None].copy(), y[:, None].copy(), interpolation, borderMode=cv2.BORDER_REPLICATE)
         for x, y in (part.T for part in parts)

@@ -113,7 +113,7 @@ def adjusted(model: Any, stills: FrameFiles, done: Callable[[int], object] = lam
 
 
 def adjust(folder: Path, stills: FrameFiles, target: Path, done: Callable[[int], object] = lambda _: None) -> bool:
-    """Read the model in a folder, and write the adjusted one to another. Return False if it stays as it was."""
+    """Read the model in a folder, and write the adjusted one to another. Return whether they differ."""
     with quiet() as pycolmap:
         before = pycolmap.Reconstruction(folder)
         model = adjusted(before, stills, done)

@@ -316,10 +316,10 @@ class _Rig:
         )
 
     def unadjusted(self) -> list[str]:
-        """Say if the still pictures did not match well enough to adjust the cameras."""
+        """Say if the cameras could not be adjusted to matches of the still pictures."""
         if not self.journal.knows("adjustment") or self.journal.result("adjustment") is not False:
             return []
-        return ["note: still pictures match too little to adjust the cameras, which stay as their features place them"]
+        return ["note: the cameras could not be adjusted to dense matches, and stay as their features place them"]
 
     def unsteady(self) -> list[str]:
         """Name the cameras that do not stand still."""

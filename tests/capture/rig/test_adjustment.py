@@ -160,9 +160,8 @@ def test_cameras_stay_as_they_are(tmp_path, monkeypatch, lack):
         monkeypatch.setattr(adjustment, "TOLERATED", 0.0)
     model = corner.model_of(true, files.names)
     assert adjustment.adjusted(model, files) is model
-    if lack == "texture":
-        with quiet():
-            (tmp_path / "model").mkdir()
-            model.write_binary(tmp_path / "model")
-        assert not adjustment.adjust(tmp_path / "model", files, tmp_path / "same")
-        assert (tmp_path / "same/images.bin").read_bytes() == (tmp_path / "model/images.bin").read_bytes()
+    with quiet():
+        (tmp_path / "model").mkdir()
+        model.write_binary(tmp_path / "model")
+    assert not adjustment.adjust(tmp_path / "model", files, tmp_path / "same")
+    assert (tmp_path / "same/images.bin").read_bytes() == (tmp_path / "model/images.bin").read_bytes()
