@@ -6,6 +6,10 @@ mistakes do not last. Last, neighbouring parts merge in the order of the angle b
 until every pair turns by more than ``LEAST_TURN``; bands of skin at joints (``joint_bands``) go to the parts beside
 them, and parts that the motion does not tell apart merge (``shared_motion``). An angle, other than a distance, neither
 favours large parts nor splits a body whose surface drifts slowly, and so the number of parts follows from the motion.
+
+Bodies bend where they are narrow. A boundary that is short for its parts (``_widths``) is therefore a joint at a smaller
+angle, and one that is long needs better evidence: where a surface looks the same in all places, its trained motion
+slides over it, and the borders of what slides run anywhere.
 """
 
 from __future__ import annotations
@@ -25,7 +29,12 @@ from .shared_motion import find_shared
 LEAST_TURN = math.radians(15.0)
 """Largest angle by which two neighbouring parts may turn against each other and still be one part."""
 MOST_DOUBTED = math.radians(45.0)
-"""Largest such angle between parts that the motion may not tell apart: more is no error of the motion."""
+"""Largest such angle between parts that the motion may not tell apart: more is no error of the motion. It grows with
+the width of a wide boundary."""
+USUAL_WIDTH = 1.5
+"""Width of a boundary between narrow and wide ones: around a limb, it is that of a part 1.4 times as long as thick."""
+NARROW_TURN = 0.7
+"""``LEAST_TURN`` of narrow boundaries, relative to that of boundaries of the usual width, at least."""
 FIRST_PARTS = 90
 """Number of parts at which merging by angle begins."""
 BOUNDARY_COST = 1.7e-3
@@ -66,18 +75,19 @@ def find_parts(patches: Patches, count: int | None = None) -> np.ndarray:
         pairs = _neighbors(patches.edges, labels)
         if not len(pairs):
             break
-        turns = relative_turns(*fits.robust(labels), pairs)
-        sizes = np.bincount(labels)
-        small = np.minimum(sizes[pairs[:, 0]], sizes[pairs[:, 1]]) < least
-        chosen = int(np.where(small, turns - 2.0 * math.pi, turns).argmin())
-        if count is None and turns[chosen] > LEAST_TURN and not small[chosen]:
+        turns, widths = relative_turns(*fits.robust(labels), pairs), _widths(patches.edges, labels, pairs)
+        small = np.bincount(labels)[pairs].min(1) < least
+        excess = turns / widths.clip(NARROW_TURN, 1.0)
+        chosen = int(np.where(small, turns - 2.0 * math.pi, excess).argmin())
+        if count is None and excess[chosen] > LEAST_TURN and not small[chosen]:
             pooled, motions = fits.robust(labels)
             band = find_band(pooled, motions, pairs, partial(relative_turns, pooled, motions))
             if band is not None:
                 labels = _renumbered(without_band(labels, patches.moments.errors_under(motions), band))
                 continue
-            close = np.flatnonzero(turns <= MOST_DOUBTED)
-            shared = find_shared(patches.moments, labels, motions, pairs[close], fit_parts)
+            doubt = np.maximum(widths, 1.0)
+            close = np.flatnonzero(turns <= MOST_DOUBTED * doubt)
+            shared = find_shared(patches.moments, labels, motions, pairs[close], doubt[close], fit_parts)
             if shared is None:
                 break
             chosen = int(close[shared])
@@ -180,6 +190,21 @@ def _neighbors(edges: np.ndarray, labels: np.ndarray) -> np.ndarray:
     """Return the pairs of neighbouring labels, [E, 2]."""
     ends = np.sort(labels[edges], axis=1)
     return np.unique(ends[ends[:, 0] != ends[:, 1]], axis=0)
+
+
+def _widths(edges: np.ndarray, labels: np.ndarray, pairs: np.ndarray) -> np.ndarray:
+    """Return the lengths of the boundaries of pairs [E, 2], relative to the square root of the smaller part's area and
+    to ``USUAL_WIDTH``, [E].
+
+    Lengths and areas are counted in patches. Where patches cover a surface evenly, a third of their mean number of
+    neighbours crosses each patch of a boundary's length.
+    """
+    parts = int(labels.max()) + 1
+    keys = np.sort(labels[edges], axis=1) @ [parts, 1]
+    crossing = np.bincount(keys, minlength=parts**2)[pairs @ [parts, 1]]
+    neighbors = 2.0 * len(edges) / len(labels)
+    area = np.bincount(labels)[pairs].min(1)
+    return 3.0 * crossing / (neighbors * np.sqrt(area) * USUAL_WIDTH)
 
 
 def _renumbered(labels: np.ndarray) -> np.ndarray:

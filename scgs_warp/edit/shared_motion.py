@@ -3,7 +3,8 @@
 A part that is narrow, or nearly round, hardly shows how it turns: errors of its trained motion then look like turns of
 some 30 degrees. Such a turn is taken for no joint if one motion explains both parts nearly as well as their own motions
 do, and nearly as well as the motions of other parts explain theirs. Errors of neighbouring points are alike, so that
-they do not average out, however many points a part has.
+they do not average out, however many points a part has. How nearly depends on the boundary between both parts: a long
+one is more likely a border of errors than a joint.
 """
 
 from __future__ import annotations
@@ -25,9 +26,11 @@ def find_shared(
     labels: np.ndarray,
     motions: Motions,
     pairs: np.ndarray,
+    doubt: np.ndarray,
     fit: Callable[[Moments, np.ndarray], tuple[Moments, Motions]],
 ) -> int | None:
-    """Return the row of ``pairs`` whose parts share one motion, that with the least distance; None if there is none.
+    """Return the row of ``pairs`` whose parts share one motion, that with the least distance for its doubt; None if
+    there is none.
 
     Distances are root mean squares over points and time.
 
@@ -36,6 +39,7 @@ def find_shared(
         labels: [P] part of each patch.
         motions: of the parts.
         pairs: [E, 2] neighbouring parts.
+        doubt: [E] factors, at least 1, of both limits.
         fit: returns the motion of each label, as ``parts.fit_parts``.
     """
     own = moments.errors_under(motions)[np.arange(len(labels)), labels]
@@ -46,6 +50,7 @@ def find_shared(
         both = moments.take(rows)
         errors = both.errors_under(fit(both, np.zeros(len(rows), np.int64))[1])[:, 0]
         together = _means(errors, both.count, (labels[rows] == pair[1]).astype(np.int64))
+        together /= doubt[row] ** 2
         if (together <= MOST_LOST**2 * alone[pair]).all() and together.max() < least:
             least, found = float(together.max()), row
     return found

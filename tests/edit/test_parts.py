@@ -190,15 +190,15 @@ def test_a_well_known_part_beside_a_badly_known_one_keeps_its_joint():
     errors = both.errors_under(fit_parts(both, np.zeros(20, np.int64))[1])[10:, 0]
     lost = errors.sum() / own[far].sum(), errors.mean() / np.median(own)
     assert lost[0] > MOST_LOST**2 and lost[1] < MOST_OFF**2, "the second bound alone would merge it"
-    assert find_shared(patches.moments, segment, fits[1], pairs[2:], fit_parts) is None
+    assert find_shared(patches.moments, segment, fits[1], pairs[2:], np.ones(1), fit_parts) is None
 
 
 def test_of_several_pairs_the_one_that_shares_its_motion_best_is_merged():
     patches, segment, _ = chain([60.0, 20.0, 25.0], noise=0.02)
     pairs, motions = np.array([[0, 1], [1, 2], [2, 3]]), fit_parts(patches.moments, segment)[1]
-    assert find_shared(patches.moments, segment, motions, pairs, fit_parts) == 1
-    assert find_shared(patches.moments, segment, motions, pairs[[0, 2]], fit_parts) == 1
-    assert find_shared(patches.moments, segment, motions, pairs[:1], fit_parts) is None
+    assert find_shared(patches.moments, segment, motions, pairs, np.ones(3), fit_parts) == 1
+    assert find_shared(patches.moments, segment, motions, pairs[[0, 2]], np.ones(2), fit_parts) == 1
+    assert find_shared(patches.moments, segment, motions, pairs[:1], np.ones(1), fit_parts) is None
 
 
 def test_two_badly_known_parts_of_a_well_known_body_do_not_merge():
@@ -209,7 +209,45 @@ def test_two_badly_known_parts_of_a_well_known_body_do_not_merge():
     both = patches.moments.take(np.flatnonzero(segment >= 3))
     errors = both.errors_under(fit_parts(both, np.zeros(20, np.int64))[1])[:, 0]
     assert errors.sum() < MOST_LOST**2 * own[segment >= 3].sum() and errors.mean() > MOST_OFF**2 * np.median(own)
-    assert find_shared(patches.moments, segment, motions, last, fit_parts) is None
+    assert find_shared(patches.moments, segment, motions, last, np.ones(1), fit_parts) is None
+
+
+def plain_width(edges: np.ndarray, labels: np.ndarray, pair: np.ndarray) -> float:
+    """Count the edges between two parts, one after the other."""
+    crossing = sum({labels[a], labels[b]} == set(pair.tolist()) for a, b in edges.tolist())
+    neighbors = sum((edges == patch).sum() for patch in range(len(labels))) / len(labels)
+    area = min(int((labels == part).sum()) for part in pair)
+    return crossing / (neighbors / 3.0) / math.sqrt(area) / parts.USUAL_WIDTH
+
+
+def grid_edges(rows: int, columns: int) -> np.ndarray:
+    """Edges of a surface of rows x columns patches, each with six neighbours but at its ends; rows are closed, as
+    around a limb."""
+    at = np.arange(rows * columns).reshape(rows, columns)
+    beside = np.roll(at, -1, axis=1)
+    pairs = [(at, beside), (at[:-1], at[1:]), (at[:-1], beside[1:])]
+    return np.concatenate([np.stack([first.ravel(), second.ravel()], 1) for first, second in pairs])
+
+
+@pytest.mark.parametrize("length", [4, 12, 40])
+def test_boundaries_are_as_wide_as_they_are_long_for_their_parts(length):
+    """Around a limb of 8 patches, a boundary is as long as the root of the ratio of girth and length, relative to the
+    root of the smaller part's area."""
+    labels = np.repeat([0, 1], [8 * length, 8 * 60])
+    edges = grid_edges(length + 60, 8)
+    (width,) = parts._widths(edges, labels, np.array([[0, 1]]))
+    assert width == pytest.approx(plain_width(edges, labels, np.array([0, 1])))
+    assert width * parts.USUAL_WIDTH == pytest.approx(math.sqrt(8 / length), rel=0.02)
+
+
+def test_widths_are_those_of_each_pair():
+    """Three rings of a tube: the third and the first do not touch; the order of an edge's ends does not matter."""
+    edges, labels = grid_edges(12, 5), np.repeat([2, 0, 1], [10, 20, 30])
+    pairs = np.array([[0, 1], [0, 2], [1, 2]])
+    expected = [plain_width(edges, labels, pair) for pair in pairs]
+    np.testing.assert_allclose(parts._widths(edges, labels, pairs), expected)
+    np.testing.assert_allclose(parts._widths(edges[:, ::-1], labels, pairs), expected)
+    assert expected[0] > 0.0 and expected[2] == 0.0
 
 
 def merged_plainly(patches: Patches) -> np.ndarray:
@@ -221,16 +259,19 @@ def merged_plainly(patches: Patches) -> np.ndarray:
             labels = parts._refined(patches, labels, parts._Fits(patches.moments))
         pairs = parts._neighbors(patches.edges, labels)
         turns = relative_turns(*fit_parts(patches.moments, labels), pairs)
+        widths = np.array([plain_width(patches.edges, labels, pair) for pair in pairs])
         small = (np.bincount(labels)[pairs] < least).any(1)
-        best = int((turns - 2.0 * math.pi * small).argmin())
-        if turns[best] > LEAST_TURN and not small[best]:
+        limits = LEAST_TURN * np.minimum(1.0, np.maximum(widths, parts.NARROW_TURN))
+        best = int(np.where(small, turns - 2.0 * math.pi, turns / limits).argmin())
+        if turns[best] > limits[best] and not small[best]:
             pooled, motions = fit_parts(patches.moments, labels)
             band = find_band(pooled, motions, pairs, partial(relative_turns, pooled, motions))
             if band is not None:
                 labels = parts._renumbered(without_band(labels, patches.moments.errors_under(motions), band))
                 continue
-            close = np.flatnonzero(turns <= parts.MOST_DOUBTED)
-            shared = find_shared(patches.moments, labels, motions, pairs[close], fit_parts)
+            doubt = np.maximum(1.0, widths)
+            close = np.flatnonzero(turns <= parts.MOST_DOUBTED * doubt)
+            shared = find_shared(patches.moments, labels, motions, pairs[close], doubt[close], fit_parts)
             if shared is None:
                 break
             best = int(close[shared])
@@ -265,11 +306,58 @@ def test_whole_periods_are_left_out(seed):
     assert state == expected and made < 24
 
 
-def test_what_turns_by_less_than_the_limit_is_one_part():
-    patches, _, _ = chain([12.0, 30.0])
+@pytest.mark.parametrize(
+    "degrees, noise, decides",
+    [([50.0], [0.01, 0.01], "lost"), ([60.0, 60.0, 60.0, 40.0], [0.01, 0.01, 0.01, 0.2, 0.2], "off")],
+)
+def test_doubt_raises_both_limits_of_a_shared_motion(degrees, noise, decides):
+    patches, segment, _ = chain(degrees, noise=noise)
+    pair, motions = np.array([len(degrees) - 1, len(degrees)]), fit_parts(patches.moments, segment)[1]
+    own = patches.moments.errors_under(motions)[np.arange(len(segment)), segment]
+    rows = np.flatnonzero(segment >= pair[0])
+    both = patches.moments.take(rows)
+    errors = both.errors_under(fit_parts(both, np.zeros(len(rows), np.int64))[1])[:, 0]
+    mine = [segment[rows] == part for part in pair]
+    lost = max(errors[each].sum() / own[rows][each].sum() for each in mine)
+    off = max(errors[each].sum() / both.count[each].sum() for each in mine) / np.median(own / patches.moments.count)
+    needed = {"lost": math.sqrt(lost) / MOST_LOST, "off": math.sqrt(off) / MOST_OFF}
+    least = max(needed.values())
+    assert needed[decides] == least > 1.2, "without doubt the parts stay apart"
+    for doubt, row in ((0.98 * least, None), (1.02 * least, 0)):
+        assert find_shared(patches.moments, segment, motions, pair[None], np.array([doubt]), fit_parts) == row
+
+
+def test_of_several_doubted_pairs_the_one_with_the_least_distance_for_its_doubt_is_merged():
+    patches, segment, _ = chain([60.0, 20.0, 25.0], noise=0.02)
+    pairs, motions = np.array([[0, 1], [1, 2], [2, 3]]), fit_parts(patches.moments, segment)[1]
+    assert find_shared(patches.moments, segment, motions, pairs, np.array([1.0, 1.0, 3.0]), fit_parts) == 2
+
+
+def two_halves(degrees: float, waist: int) -> np.ndarray:
+    """Labels found in a sheet of 8 x 24 patches whose halves, 4 x 24 each, turn against each other. Of the 24 patches
+    along their boundary, ``waist`` are joined across it."""
+    rest = np.random.default_rng(0).random((192 * 25, 3)) * [8.0, 24.0, 0.0]
+    nearest = rest[:, 0].astype(np.int64) * 24 + rest[:, 1].astype(np.int64)
+    pivot, tracks = np.array([4.0, 12.0, 0.0]), []
+    for time in TIMES:
+        turn = from_axis((0, 0, 1), degrees * 0.5 * (1.0 - math.cos(2.0 * math.pi * time)))
+        tracks.append(np.where(rest[:, :1] > 4.0, rotate(turn, rest - pivot) + pivot, rest))
+    patches = make_patches(np.stack(tracks), nearest[:, None], np.ones((len(rest), 1)))
+    at = np.arange(192).reshape(8, 24)
+    edges = [np.stack([at[:, :-1].ravel(), at[:, 1:].ravel()], 1), np.stack([at[3, :waist], at[4, :waist]], 1)]
+    edges += [np.stack([half[:-1].ravel(), half[1:].ravel()], 1) for half in (at[:4], at[4:])]
+    return find_parts(patches._replace(edges=np.concatenate(edges)))
+
+
+def test_narrow_boundaries_are_joints_at_smaller_angles():
+    assert two_halves(12.5, waist=2).max() == 1
+    assert two_halves(12.5, waist=24).max() == 0
+    assert two_halves(9.0, waist=2).max() == 0
+    patches, _, _ = chain([9.0, 30.0])
     assert find_parts(patches).max() == 1
     patches, _, _ = chain([3.0, 2.0])
     assert find_parts(patches).max() == 0
+    assert math.degrees(LEAST_TURN) == pytest.approx(15)
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 6])
