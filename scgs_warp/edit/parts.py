@@ -7,9 +7,9 @@ until every pair turns by more than ``LEAST_TURN``; bands of skin at joints (``j
 them, and parts that the motion does not tell apart merge (``shared_motion``). An angle, other than a distance, neither
 favours large parts nor splits a body whose surface drifts slowly, and so the number of parts follows from the motion.
 
-Bodies bend where they are narrow. A boundary that is short for its parts (``_widths``) is therefore a joint at a smaller
-angle, and one that is long needs better evidence: where a surface looks the same in all places, its trained motion
-slides over it, and the borders of what slides run anywhere.
+Bodies bend where they are narrow. A boundary that is short for its parts (``_widths``) is therefore a joint at a
+smaller angle, and one that is long needs better evidence: where a surface looks the same in all places, its trained
+motion slides over it, and the borders of what slides run anywhere.
 """
 
 from __future__ import annotations

@@ -110,3 +110,27 @@ def rigidity(instants: list[Tensor], graph: Graph) -> Tensor:
     first, second = instants[-2:]
     energy = arap_energy(first, second, graph.neighbors, graph.weights, reverse=graph.reverse)
     return energy @ torch.ones_like(energy)
+
+
+def tearing(instants: Tensor, neighbors: int) -> float:
+    """Return by how much a motion tears a body apart, 0 (rigid) to 1.
+
+    It is the mean of x^2 / (x^2 + ``STRETCHED``^2) over the edges between neighbours of each instant and over all
+    instants, where x is the change of an edge's length from the one to the other, in spacings of the points.
+
+    Args:
+        instants: [T, M, 3] places of the points.
+        neighbors: number of neighbours of each point.
+    """
+    count, torn = min(neighbors, instants.shape[1] - 1), []
+    if count < 1:
+        return 0.0
+    for first in instants:
+        ends = trajectory_graph(first[None].contiguous(), count)[0].long()
+        known = ends >= 0
+        lengths = (instants[:, ends.clamp(min=0)] - instants[:, :, None]).norm(dim=3)
+        away = (first[ends.clamp(min=0)] - first[:, None]).norm(dim=2)
+        change = (lengths - away) / away[:, 0].median().clamp(min=1e-12)
+        share = change.square() / (change.square() + STRETCHED**2)
+        torn.append(share[:, known & share.isfinite().all(0)].double().mean())
+    return float(torch.stack(torn).nan_to_num().mean())

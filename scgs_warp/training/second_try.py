@@ -4,6 +4,10 @@ Images of single moments tell neither which of two legs passes the other nor how
 move no further than the images require. The second try adds frame after frame, so that spheres begin in the pose of
 the frame before, and ties each sphere to its neighbours at that moment (``rigidity.momentary_graph``). The spheres that
 show the training views better are kept: bodies that truly part fit the second try worse.
+
+Where limbs have exchanged their places halfway, training views are shown as well as by the true motion, or better. But
+then the body is torn: what belongs together at one moment is far apart at another. If the subject may be one body and
+the first motion tears it, a second one that tears it less is kept, unless it shows the views clearly worse.
 """
 
 from __future__ import annotations
@@ -16,16 +20,32 @@ from typing import Protocol
 import torch
 
 from ..data.dataset import Dataset, spread
+from ..motion.rigidity import tearing
+from ..motion.spheres import Spheres
 from .density_control import control_density, density_due, visible_gaussians
 from .frames import Frames
 from .multi_view import check_replicas
 from .second_config import second_config
+from .silhouettes import is_one_piece
 from .state import StepResult, TrainState
 
 VIEWS = 200
 """Largest number of training views by which both tries are compared."""
 LEAST_GAIN = 0.1
 """PSNR in dB by which the second motion must be better: a smaller gain in stage 1 may be chance."""
+MOST_LOSS = 1.0
+"""PSNR in dB by which the second motion of one body may be worse if it tears the body less. Firmer spheres show less
+detail; two tries that differ by chance alone may also differ by this much."""
+TORN = 0.03
+"""Tearing from which a body counts as torn. Bodies whose limbs keep their places have a third to two thirds of it."""
+LESS_TORN = 0.75
+"""Tearing of the second motion, relative to the first, below which it counts as less."""
+INSTANTS = 16
+"""Number of instants at which tearing is measured."""
+SOLID = 0.1
+"""Opacity from which a sphere belongs to the body."""
+BESIDE = 6
+"""Number of neighbours of a sphere."""
 
 
 class Steps(Protocol):
@@ -79,7 +99,11 @@ def try_again(
         go_on(second)
     check_replicas(second)
     before, after = shown_psnr(state, frames.frames), shown_psnr(second, frames.frames)
-    better = after > before + LEAST_GAIN
+    better, reason = after > before + LEAST_GAIN, ""
+    if not better and after > before - MOST_LOSS and is_one_piece(frames.frames):
+        torn = torn_by(state), torn_by(second)
+        better = torn[0] > TORN and torn[1] < LESS_TORN * torn[0]
+        reason = f": it tears the body less ({torn[1]:.3f}, not {torn[0]:.3f})" if better else ""
     if state.group is not None:  # the first process decides: others may round differently
         better = state.group.any(state.group.first and better)
     if better:
@@ -87,7 +111,16 @@ def try_again(
         state.exposure, state.exposure_optimizer = second.exposure, second.exposure_optimizer
         state.enter(second.gaussians, second.motion)
     kept = "second" if better else "first"
-    return f"training views: {before:.2f} dB, the second time {after:.2f} dB; the {kept} motion is kept"
+    return f"training views: {before:.2f} dB, the second time {after:.2f} dB; the {kept} motion is kept{reason}"
+
+
+@torch.no_grad()
+def torn_by(state: TrainState) -> float:
+    """Return by how much the motion of the solid spheres tears the body (``rigidity.tearing``)."""
+    spheres, gaussians = state.motion, state.gaussians
+    assert isinstance(spheres, Spheres)
+    places = gaussians.means + spheres.translations(gaussians.means, torch.linspace(0.0, 1.0, INSTANTS))
+    return tearing(places[:, gaussians.opacities() >= SOLID], BESIDE)
 
 
 @torch.no_grad()

@@ -40,6 +40,8 @@ THIN = 0.02
 """Half width of the silhouette, as a share of the image's width, below which a subject is thin."""
 PART = 0.005
 """Share of the silhouette's pixels from which a connected region counts as a part."""
+SELDOM = 0.05
+"""Share of the silhouettes below which several regions say nothing about the subject."""
 JUDGED_VIEWS = 20
 """Largest number of images from which thin subjects and separate parts are told."""
 
@@ -146,12 +148,23 @@ def is_thin(data: Dataset) -> bool:
 
 def is_in_parts(data: Dataset) -> bool:
     """Decide whether the subject consists of separate parts: at least half of the silhouettes do."""
+    return _share_in_parts(data, JUDGED_VIEWS) >= 0.5
+
+
+def is_one_piece(data: Dataset) -> bool:
+    """Decide whether the subject may be one body that never falls apart, since its silhouettes do not. A few may, where
+    something thin is lost between pixels."""
+    return bool(data.with_alpha) and _share_in_parts(data, MEASURED_VIEWS) < SELDOM
+
+
+def _share_in_parts(data: Dataset, most: int) -> float:
+    """Return the share of at most about ``most`` silhouettes that consist of several regions; 0 without any."""
     separate = []
-    for _, covered in _covered(data, JUDGED_VIEWS):
+    for _, covered in _covered(data, most):
         regions: Any = label(covered, structure=np.ones((3, 3)))
         sizes = np.bincount(regions[0].ravel())[1:]
         separate.append(int((sizes >= PART * sizes.sum()).sum()) >= 2)
-    return bool(separate) and float(np.mean(separate)) >= 0.5
+    return float(np.mean(separate)) if separate else 0.0
 
 
 def half_thickness(data: Dataset, normalisation: Normalisation) -> float:

@@ -8,7 +8,15 @@ import pytest
 import torch
 
 from scgs_warp.config.fields import LossConfig
-from scgs_warp.motion.rigidity import arap_times, arap_weight, build_graph, momentary_graph, rigidity
+from scgs_warp.motion.rigidity import (
+    STRETCHED,
+    arap_times,
+    arap_weight,
+    build_graph,
+    momentary_graph,
+    rigidity,
+    tearing,
+)
 from scgs_warp.seeding import generator
 
 
@@ -120,3 +128,56 @@ def test_the_energy_is_between_the_last_two_instants():
     bent = rest * torch.tensor([1.5, 1.0, 1.0])
     assert float(rigidity([bent, rest, rest + 0.5], graph)) < 1e-6
     assert torch.equal(rigidity([rest + 0.5, rest, bent], graph), rigidity([rest, bent], graph))
+
+
+def swung(points: torch.Tensor, angle: float, shift: float) -> torch.Tensor:
+    turn = torch.tensor([[math.cos(angle), -math.sin(angle), 0.0], [math.sin(angle), math.cos(angle), 0.0], [0, 0, 1]])
+    return points @ turn.T + shift
+
+
+def test_a_rigid_motion_tears_nothing():
+    points = torch.rand(40, 3, generator=generator(0, 1))
+    instants = torch.stack([swung(points, 0.7 * time, 0.3 * time) for time in range(5)])
+    assert tearing(instants, 6) < 1e-6
+    assert tearing(instants[:, :1], 6) == 0.0 and tearing(instants[:, :0], 6) == 0.0
+
+
+def test_tearing_is_that_of_the_edges_one_after_the_other():
+    random = generator(0, 2)
+    instants = torch.rand(1, 12, 3, generator=random) + 0.2 * torch.randn(4, 12, 3, generator=random)
+    expected = []
+    for first in instants.double():
+        away = torch.cdist(first, first) + 1e9 * torch.eye(12)
+        spacing = away.min(1).values.median()
+        shares = []
+        for other in instants.double():
+            for point in range(12):
+                for end in away[point].argsort()[:3].tolist():
+                    change = ((other[point] - other[end]).norm() - away[point, end]) / spacing
+                    shares.append(float(change**2 / (change**2 + STRETCHED**2)))
+        expected.append(sum(shares) / len(shares))
+    assert tearing(instants, 3) == pytest.approx(sum(expected) / 4, rel=1e-5)
+    assert 0.001 < tearing(instants, 3) < 1.0
+
+
+def test_two_limbs_that_exchange_their_ends_are_torn_more_than_two_that_pass():
+    """Legs of ten points swing past each other; with exchanged tracks, their lower halves stay behind instead."""
+    hip, lengths, times = torch.tensor([0.0, 0.0, 1.0]), torch.linspace(0.0, 1.0, 10), torch.linspace(-1.0, 1.0, 9)
+    legs = torch.stack([
+        torch.cat([
+            hip + torch.stack([side * 0.1 + 0 * lengths, lengths * math.sin(angle), -lengths * math.cos(angle)], 1)
+            for side, angle in ((-1.0, 0.6 * time), (1.0, -0.6 * time))
+        ])
+        for time in times.tolist()
+    ])  # fmt: skip
+    exchanged = legs.clone()
+    after = times > 0
+    exchanged[after, 5:10], exchanged[after, 15:] = legs[after, 15:], legs[after, 5:10]
+    assert tearing(exchanged, 4) > 2.0 * tearing(legs, 4)
+
+
+def test_places_that_are_not_finite_do_not_count():
+    points = torch.rand(40, 3, generator=generator(0, 3))
+    instants = torch.stack([points, points + 0.5])
+    instants[1, 3] = float("nan")
+    assert tearing(instants, 6) < 1e-6

@@ -109,6 +109,51 @@ def test_the_better_motion_is_kept(first_psnr, better, tried, tmp_path, device, 
     assert len(notes) == 1 and f"the {better} motion is kept" in notes[0]
 
 
+TORN = second_try.TORN
+
+
+@pytest.mark.parametrize(
+    ("torn", "loss", "whole", "better"),
+    [
+        ((2.0 * TORN, TORN), 0.5, True, "second"),
+        ((2.0 * TORN, TORN), 0.95, True, "second"),
+        ((2.0 * TORN, TORN), 1.05, True, "first"),  # the views are shown clearly worse
+        ((2.0 * TORN, TORN), 0.5, False, "first"),  # what falls apart may tear
+        ((2.0 * TORN, 1.6 * TORN), 0.5, True, "first"),  # hardly less
+        ((0.95 * TORN, 0.1 * TORN), 0.5, True, "first"),  # no body is torn
+        ((2.0 * TORN, 9.0 * TORN), -0.2, True, "second"),  # a gain decides alone
+    ],
+)
+def test_a_motion_that_tears_a_body_less_is_kept(torn, loss, whole, better, tried, tmp_path, monkeypatch):
+    scores, tears, kept = iter([15.0, 15.0 - loss]), iter(torn), []
+    monkeypatch.setattr(second_try, "shown_psnr", lambda state, data: kept.append(spheres_of(state)) or next(scores))
+    monkeypatch.setattr(second_try, "torn_by", lambda state: next(tears))
+    monkeypatch.setattr(second_try, "is_one_piece", lambda data: whole)
+    begun, begin_main = [], TrainState.begin_main
+    monkeypatch.setattr(TrainState, "begin_main", lambda state: begun.append(spheres_of(state)) or begin_main(state))
+    fit(CONFIG, tiny_dataset(6), output=tmp_path / "run")
+    assert torch.equal(begun[0], kept[{"first": 0, "second": 1}[better]])
+    (note,) = notes_of(tmp_path / "run")
+    assert f"the {better} motion is kept" in note
+    assert (f"it tears the body less ({torn[1]:.3f}, not {torn[0]:.3f})" in note) == (better == "second" and loss > 0)
+
+
+def test_tearing_is_that_of_the_solid_spheres(device):
+    """A faint stray that flies away does not tear the body."""
+    state = TrainState.begin(CONFIG, tiny_dataset(6), device)
+    with torch.no_grad():
+        state.gaussians.opacity_logits[:] = 2.0
+        state.gaussians.opacity_logits[3] = -6.0
+    moves = torch.linspace(0.0, 1.0, second_try.INSTANTS)[:, None, None] * torch.tensor([0.2, 0.1, 0.0])
+    flies = moves.repeat(1, len(state.gaussians), 1)
+    flies[:, 3] *= 100.0
+    state.motion.translations = lambda means, times: flies.to(means.device)
+    assert second_try.torn_by(state) < 1e-6
+    with torch.no_grad():
+        state.gaussians.opacity_logits[3] = 2.0
+    assert second_try.torn_by(state) > 1e-4
+
+
 def test_what_is_asked_for_is_not_tried_again(tried, tmp_path, monkeypatch):
     monkeypatch.setattr(loop, "try_again", lambda *args: pytest.fail("tried again"))
     for name in ("track", "moment"):

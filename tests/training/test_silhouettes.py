@@ -232,6 +232,24 @@ def test_spheres_of_separate_parts_are_led_back(changes, fade):
     assert not silhouettes.is_in_parts(Dataset([alone], folder=Path("speck"), split="train"))
 
 
+@pytest.mark.parametrize(("apart", "one"), [(0, True), (2, True), (3, False), (20, False)])
+def test_a_body_of_one_piece_hardly_ever_shows_two(apart, one):
+    """Of 50 images, two may show two regions."""
+    frames = []
+    for index in range(50):
+        alpha = torch.zeros(HEIGHT, WIDTH)
+        alpha[30:60, 20:60] = 1.0
+        if index < apart:
+            alpha[:, 38:42] = 0.0
+        frames.append(Frame(camera(), 0.01 * index, torch.rand(HEIGHT, WIDTH, 3), alpha))
+    assert silhouettes.is_one_piece(Dataset(frames, folder=Path("body"), split="train")) == one
+
+
+def test_without_silhouettes_nothing_is_known_to_be_one_piece():
+    filled = Dataset([Frame(camera(), 0.0, torch.rand(HEIGHT, WIDTH, 3))], folder=Path("filled"), split="train")
+    assert not silhouettes.is_one_piece(filled)
+
+
 def test_images_without_alpha_have_neither():
     frames = [Frame(camera(), 0.1 * i, torch.rand(HEIGHT, WIDTH, 3)) for i in range(3)]
     resolved = resolve_auto(tiny_config(), Dataset(frames, folder=Path("filled"), split="train"))
