@@ -193,15 +193,18 @@ def _neighbors(edges: np.ndarray, labels: np.ndarray) -> np.ndarray:
 
 
 def _widths(edges: np.ndarray, labels: np.ndarray, pairs: np.ndarray) -> np.ndarray:
-    """Return the lengths of the boundaries of pairs [E, 2], relative to the square root of the smaller part's area and
-    to ``USUAL_WIDTH``, [E].
+    """Return the lengths of the boundaries of pairs, [E], relative to the square root of the smaller part's area and to
+    ``USUAL_WIDTH``.
 
     Lengths and areas are counted in patches. Where patches cover a surface evenly, a third of their mean number of
     neighbours crosses each patch of a boundary's length.
+
+    Args:
+        pairs: [E, 2] labels, the smaller one first.
     """
     parts = int(labels.max()) + 1
-    keys = np.sort(labels[edges], axis=1) @ [parts, 1]
-    crossing = np.bincount(keys, minlength=parts**2)[pairs @ [parts, 1]]
+    first, second = np.sort(labels[edges], axis=1).T
+    crossing = np.bincount(parts * first + second, minlength=parts**2)[parts * pairs[:, 0] + pairs[:, 1]]
     neighbors = 2.0 * len(edges) / len(labels)
     area = np.bincount(labels)[pairs].min(1)
     return 3.0 * crossing / (neighbors * np.sqrt(area) * USUAL_WIDTH)
