@@ -31,8 +31,8 @@ LEAST_TURN = math.radians(15.0)
 MOST_DOUBTED = math.radians(45.0)
 """Largest such angle between parts that the motion may not tell apart: more is no error of the motion. It grows with
 the width of a wide boundary."""
-USUAL_WIDTH = 1.5
-"""Width of a boundary between narrow and wide ones: around a limb, it is that of a part 1.4 times as long as thick."""
+USUAL_WIDTH = 2.0
+"""Width of a boundary between narrow and wide ones: around a limb, it is that of a part 0.8 times as long as thick."""
 NARROW_TURN = 0.7
 """``LEAST_TURN`` of narrow boundaries, relative to that of boundaries of the usual width, at least."""
 FIRST_PARTS = 90
