@@ -13,13 +13,15 @@ of the default number of steps (``fig``) and of six times as many (``long``):
         --json benchmarks/results/posing-pictures-long.json
 
 and of two glTF characters, ``man`` and ``robot``, filmed by ``apps/synthesize.py --size 200 --train 150`` (``robot``
-with ``--clip Robot_Dance``) and trained with ``--preset cpu --steps 6000 --threads 1`` (``man-long`` without
-``--steps``, ``robot-1`` with ``--seed 1``):
+with ``--clip Robot_Dance``, ``robot-walk`` with ``--clip Robot_Walking``) and trained with ``--preset cpu --threads
+1``, robots with ``--steps 6000`` (``man-1`` and ``robot-1`` with ``--seed 1``):
 
-    python benchmarks/parts.py --run man man-long --data data/man --mesh CesiumMan.glb \\
+    python benchmarks/parts.py --run man man-1 --data data/man --mesh CesiumMan.glb \\
         --json benchmarks/results/parts-man.json
     python benchmarks/parts.py --run robot robot-1 --data data/robot --mesh RobotExpressive.glb \\
         --json benchmarks/results/parts-robot.json
+    python benchmarks/parts.py --run robot-walk --data data/robot-walk --mesh RobotExpressive.glb \\
+        --json benchmarks/results/parts-robot-walk.json
 """
 
 from __future__ import annotations

@@ -203,7 +203,9 @@ REPEATABLE = {
     "capture-long-films": Repeatable(
         long_film_memory, ("long-film-memory",), ("scgs_warp/training/silhouettes.py", "scgs_warp/data/cache.py")
     ),
-    "posing-parts": Repeatable(parts_found, ("parts-figure", "parts-long", "parts-man", "parts-robot"), EDITING),
+    "posing-parts": Repeatable(
+        parts_found, ("parts-figure", "parts-long", "parts-man", "parts-robot", "parts-robot-walk"), EDITING
+    ),
     "posing-bones": Repeatable(bones_shown, ("parts-long",), EDITING),
     "posing-gestures": Repeatable(gestures, ("posing-figure",), EDITING),
     "posing-gestures-long": Repeatable(gestures, ("posing-long",), EDITING),
