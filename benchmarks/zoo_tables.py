@@ -140,6 +140,7 @@ def crossing(source: Source) -> str:
         "cpu": "`cpu`, without a second try",
         "moment": "`cpu --progressive`, `pretrain.arap_by=moment`, `pretrain.arap_weight=0.03`",
         "auto": "**`cpu`**",
+        "views-1": "`cpu --seed 1`, chosen by the training views alone",
         "auto-1": "**`cpu --seed 1`**",
     }
     lines = []

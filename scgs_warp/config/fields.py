@@ -168,7 +168,7 @@ class PretrainConfig:
     """Weight of ARAP on the trajectories of the spheres."""
     arap_by: Literal["auto", "track", "moment"] = newer("auto", before="track")
     """Neighbours of ARAP: over the whole time (track, supplement), at the first time compared if they stay (moment), or
-    (auto) by track, then for cut-out subjects that are not thin a second time by moment; the better motion is kept."""
+    (auto) by track, then for cut-out subjects that are not thin a second time by moment (``training.second_try``)."""
     random_background: bool = True
     """Change the background in every step if the data has alpha, so that black cloth is not mistaken for empty
     space."""
