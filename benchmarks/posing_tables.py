@@ -7,6 +7,8 @@ of the default number of steps (``fig``) and of six times as many (``long``):
     python apps/train.py --preset quick --steps 42000 --seed S --device cuda --output long-S
     python benchmarks/parts.py --run long-0 long-1 long-2 --data data/figure --json benchmarks/results/parts-long.json
     python benchmarks/posing.py --run long-0 long-1 long-2 --json benchmarks/results/posing-long.json
+    python apps/train.py --preset quick --steps 42000 --threads 1 --output long-cpu
+    python benchmarks/parts.py --run long-cpu --data data/figure --json benchmarks/results/parts-long-cpu.json
     python benchmarks/posing_pictures.py --run fig-0 fig-1 fig-2 --size 200 \\
         --json benchmarks/results/posing-pictures.json
     python benchmarks/posing_pictures.py --run long-0 long-1 long-2 --size 200 \\

@@ -204,7 +204,9 @@ REPEATABLE = {
         long_film_memory, ("long-film-memory",), ("scgs_warp/training/silhouettes.py", "scgs_warp/data/cache.py")
     ),
     "posing-parts": Repeatable(
-        parts_found, ("parts-figure", "parts-long", "parts-man", "parts-robot", "parts-robot-walk"), EDITING
+        parts_found,
+        ("parts-figure", "parts-long", "parts-long-cpu", "parts-man", "parts-robot", "parts-robot-walk"),
+        EDITING,
     ),
     "posing-bones": Repeatable(bones_shown, ("parts-long",), EDITING),
     "posing-gestures": Repeatable(gestures, ("posing-figure",), EDITING),
