@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .parts import LEAST_TURN, fit_parts, relative_turns
+from .parts import LEAST_TURN, NARROW_TURN, fit_parts, relative_turns
 from .patches import Motions, Patches
 from .rotations import from_matrix, logarithm
 
@@ -94,7 +94,7 @@ def _fit(patches: Patches, labels: np.ndarray, motions: Motions, pair: list[int]
         offset[0] = 0.0
     near = values * alone / (values + max(play2 / extent**2, NEAR * known))
     play = math.sqrt(float(((A @ axes @ near - b) ** 2).sum() / times))
-    if turn < LEAST_TURN:
+    if turn < NARROW_TURN * LEAST_TURN:
         return Joint(-1, middle + patches.centre, None, turn, play, 0.0)
     return Joint(-1, middle + axes @ offset + patches.centre, _axis(turned, motions.rotations[first, 0]), turn, play,
                  known / (known + prior))  # fmt: skip

@@ -3,11 +3,12 @@
 Patches merge in three stages. First those whose union moves most rigidly (Ward's criterion), pairwise in rounds, down
 to a few dozen parts. Then patches change to a neighbouring part whose motion explains theirs better, so that early
 mistakes do not last. Last, neighbouring parts merge in the order of the angle by which they turn against each other,
-until every pair turns by more than ``LEAST_TURN``; bands of skin at joints (``joint_bands``) go to the parts beside
-them, and parts that the motion does not tell apart merge (``shared_motion``). An angle, other than a distance, neither
-favours large parts nor splits a body whose surface drifts slowly, and so the number of parts follows from the motion.
+until every pair turns by more than the least angle of a joint; bands of skin at joints (``joint_bands``) go to the
+parts beside them, and parts that the motion does not tell apart merge (``shared_motion``). An angle, other than a
+distance, neither favours large parts nor splits a body whose surface drifts slowly, and so the number of parts follows
+from the motion.
 
-Bodies bend where they are narrow. A boundary that is short for its parts (``_widths``) is therefore a joint at a
+Bodies bend where they are narrow. A boundary that is short for its parts (``_widths``) therefore counts as a joint at a
 smaller angle, and one that is long needs better evidence: where a surface looks the same in all places, its trained
 motion slides over it, and the borders of what slides run anywhere.
 """
@@ -27,14 +28,18 @@ from .patches import Moments, Motions, Patches
 from .shared_motion import find_shared
 
 LEAST_TURN = math.radians(15.0)
-"""Largest angle by which two neighbouring parts may turn against each other and still be one part."""
+"""Largest angle by which two neighbouring parts may turn against each other and still be one part, if their boundary is
+not narrow."""
 MOST_DOUBTED = math.radians(45.0)
-"""Largest such angle between parts that the motion may not tell apart: more is no error of the motion. It grows with
-the width of a wide boundary."""
+"""Largest such angle between parts that the motion may not tell apart: more is no error of the motion. A wide
+boundary raises it."""
 USUAL_WIDTH = 2.0
 """Width of a boundary between narrow and wide ones: around a limb, it is that of a part 0.8 times as long as thick."""
 NARROW_TURN = 0.7
-"""``LEAST_TURN`` of narrow boundaries, relative to that of boundaries of the usual width, at least."""
+"""Share of ``LEAST_TURN`` that counts where a boundary has at most this share of the usual width; in between, the angle
+grows with the width."""
+MOST_DOUBT = 2.5
+"""Largest factor by which a wide boundary raises the limits on a shared motion."""
 FIRST_PARTS = 90
 """Number of parts at which merging by angle begins."""
 BOUNDARY_COST = 1.7e-3
@@ -85,7 +90,7 @@ def find_parts(patches: Patches, count: int | None = None) -> np.ndarray:
             if band is not None:
                 labels = _renumbered(without_band(labels, patches.moments.errors_under(motions), band))
                 continue
-            doubt = np.maximum(widths, 1.0)
+            doubt = widths.clip(1.0, MOST_DOUBT)
             close = np.flatnonzero(turns <= MOST_DOUBTED * doubt)
             shared = find_shared(patches.moments, labels, motions, pairs[close], doubt[close], fit_parts)
             if shared is None:

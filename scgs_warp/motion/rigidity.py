@@ -119,10 +119,11 @@ def tearing(instants: Tensor, neighbors: int) -> float:
     instants, where x is the change of an edge's length from the one to the other, in spacings of the points.
 
     Args:
-        instants: [T, M, 3] places of the points.
+        instants: [T, M, 3] places of the points; points that are not always finite do not count.
         neighbors: number of neighbours of each point.
     """
-    count, torn = min(neighbors, instants.shape[1] - 1), []
+    instants, torn = instants[:, instants.isfinite().all(2).all(0)], []
+    count = min(neighbors, instants.shape[1] - 1)
     if count < 1:
         return 0.0
     for first in instants:
@@ -132,5 +133,5 @@ def tearing(instants: Tensor, neighbors: int) -> float:
         away = (first[ends.clamp(min=0)] - first[:, None]).norm(dim=2)
         change = (lengths - away) / away[:, 0].median().clamp(min=1e-12)
         share = change.square() / (change.square() + STRETCHED**2)
-        torn.append(share[:, known & share.isfinite().all(0)].double().mean())
-    return float(torch.stack(torn).nan_to_num().mean())
+        torn.append(share[:, known].double().mean())
+    return float(torch.stack(torn).mean())

@@ -2,8 +2,8 @@
 
 Images of single moments tell neither which of two legs passes the other nor how far a round head turns, and spheres
 move no further than the images require. The second try adds frame after frame, so that spheres begin in the pose of
-the frame before, and ties each sphere to its neighbours at that moment (``rigidity.momentary_graph``). The spheres that
-show the training views better are kept: bodies that truly part fit the second try worse.
+the frame before, and ties each sphere to its neighbours at that moment (``rigidity.momentary_graph``). Its spheres are
+kept if they show the training views better: bodies that truly part fit the second try worse.
 
 Where limbs have exchanged their places halfway, training views are shown as well as by the true motion, or better. But
 then the body is torn: what belongs together at one moment is far apart at another. If the subject may be one body and
@@ -22,6 +22,8 @@ import torch
 from ..data.dataset import Dataset, spread
 from ..motion.rigidity import tearing
 from ..motion.spheres import Spheres
+from ..ops.sampling import farthest_points
+from ..runtime.environment import one_piece
 from .density_control import control_density, density_due, visible_gaussians
 from .frames import Frames
 from .multi_view import check_replicas
@@ -34,8 +36,8 @@ VIEWS = 200
 LEAST_GAIN = 0.1
 """PSNR in dB by which the second motion must be better: a smaller gain in stage 1 may be chance."""
 MOST_LOSS = 1.0
-"""PSNR in dB by which the second motion of one body may be worse if it tears the body less. Firmer spheres show less
-detail; two tries that differ by chance alone may also differ by this much."""
+"""PSNR in dB by which the second motion of one body may be worse if it tears the body less: firmer spheres show less
+detail."""
 TORN = 0.03
 """Tearing from which a body counts as torn. Bodies whose limbs keep their places have a third to two thirds of it."""
 LESS_TORN = 0.75
@@ -46,6 +48,8 @@ SOLID = 0.1
 """Opacity from which a sphere belongs to the body."""
 BESIDE = 6
 """Number of neighbours of a sphere."""
+POINTS = 256
+"""Number of spheres at which tearing is measured: among more, a smaller share of the edges crosses a tear."""
 
 
 class Steps(Protocol):
@@ -119,8 +123,15 @@ def torn_by(state: TrainState) -> float:
     """Return by how much the motion of the solid spheres tears the body (``rigidity.tearing``)."""
     spheres, gaussians = state.motion, state.gaussians
     assert isinstance(spheres, Spheres)
+    spheres.eval()
     places = gaussians.means + spheres.translations(gaussians.means, torch.linspace(0.0, 1.0, INSTANTS))
-    return tearing(places[:, gaussians.opacities() >= SOLID], BESIDE)
+    spheres.train()
+    places = places[:, gaussians.opacities() >= SOLID]
+    if places.shape[1] > POINTS:
+        flat = places.permute(1, 0, 2).reshape(places.shape[1], -1).contiguous()
+        places = places[:, farthest_points(flat, POINTS).to(places.device)]
+    with one_piece():
+        return tearing(places, BESIDE)
 
 
 @torch.no_grad()

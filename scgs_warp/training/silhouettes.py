@@ -7,6 +7,7 @@ and the silhouette has a gradient at any range.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Hashable, Iterator
 from typing import Any, NamedTuple
 
@@ -154,17 +155,17 @@ def is_in_parts(data: Dataset) -> bool:
 def is_one_piece(data: Dataset) -> bool:
     """Decide whether the subject may be one body that never falls apart, since its silhouettes do not. A few may, where
     something thin is lost between pixels."""
-    return bool(data.with_alpha) and _share_in_parts(data, MEASURED_VIEWS) < SELDOM
+    return _share_in_parts(data, MEASURED_VIEWS) < SELDOM
 
 
 def _share_in_parts(data: Dataset, most: int) -> float:
-    """Return the share of at most about ``most`` silhouettes that consist of several regions; 0 without any."""
+    """Return the share of at most about ``most`` silhouettes that consist of several regions; NaN without any."""
     separate = []
     for _, covered in _covered(data, most):
         regions: Any = label(covered, structure=np.ones((3, 3)))
         sizes = np.bincount(regions[0].ravel())[1:]
         separate.append(int((sizes >= PART * sizes.sum()).sum()) >= 2)
-    return float(np.mean(separate)) if separate else 0.0
+    return float(np.mean(separate)) if separate else math.nan
 
 
 def half_thickness(data: Dataset, normalisation: Normalisation) -> float:

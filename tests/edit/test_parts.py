@@ -269,7 +269,7 @@ def merged_plainly(patches: Patches) -> np.ndarray:
             if band is not None:
                 labels = parts._renumbered(without_band(labels, patches.moments.errors_under(motions), band))
                 continue
-            doubt = np.maximum(1.0, widths)
+            doubt = np.minimum(parts.MOST_DOUBT, np.maximum(1.0, widths))
             close = np.flatnonzero(turns <= parts.MOST_DOUBTED * doubt)
             shared = find_shared(patches.moments, labels, motions, pairs[close], doubt[close], fit_parts)
             if shared is None:
@@ -358,6 +358,38 @@ def test_narrow_boundaries_are_joints_at_smaller_angles():
     patches, _, _ = chain([3.0, 2.0])
     assert find_parts(patches).max() == 0
     assert math.degrees(LEAST_TURN) == pytest.approx(15)
+
+
+def test_a_joint_at_a_small_angle_is_a_joint_like_any_other():
+    patches, segment, joints = chain([13.0])
+    labels = find_parts(patches)
+    assert same_partition(labels, segment)
+    (joint,) = [joint for joint in find_joints(patches, labels) if joint.parent >= 0]
+    assert np.linalg.norm((joint.point - joints[0])[[0, 2]]) < 0.03 and joint.confidence > 0.5
+    assert joint.axis is not None and abs(joint.axis[1]) > math.cos(math.radians(10))
+
+
+def test_the_doubt_of_a_wide_boundary_is_limited(monkeypatch):
+    """Two rows of patches lie side by side."""
+    asked: list[float] = []
+
+    def shared(moments, labels, motions, pairs, doubt, fit):
+        asked.extend(doubt.tolist())
+
+    monkeypatch.setattr(parts, "find_shared", shared)
+    monkeypatch.setattr(parts, "relative_turns", lambda *args: np.radians([60.0]))
+    nearest = np.repeat(np.arange(160), 9)
+    rest = np.stack([nearest // 80, nearest % 80, 0 * nearest], 1) + np.random.default_rng(0).random((1440, 3))
+    patches = make_patches(np.stack([rest] * len(TIMES)), nearest[:, None], np.ones((len(rest), 1)))
+    at = np.arange(160).reshape(2, 80)
+    edges = [np.stack([at[:, :-1].ravel(), at[:, 1:].ravel()], 1), at.T]
+    patches = patches._replace(edges=np.concatenate(edges))
+    labels = np.repeat([0, 1], 80)
+    monkeypatch.setattr(parts, "_merge_by_cost", lambda patches, count: labels)
+    monkeypatch.setattr(parts, "_refined", lambda patches, labels, fits: labels)
+    find_parts(patches)
+    width = parts._widths(patches.edges, labels, np.array([[0, 1]]))[0]
+    assert width > parts.MOST_DOUBT and asked == [parts.MOST_DOUBT]
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 6])

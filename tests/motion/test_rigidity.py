@@ -177,7 +177,10 @@ def test_two_limbs_that_exchange_their_ends_are_torn_more_than_two_that_pass():
 
 
 def test_places_that_are_not_finite_do_not_count():
-    points = torch.rand(40, 3, generator=generator(0, 3))
-    instants = torch.stack([points, points + 0.5])
-    instants[1, 3] = float("nan")
-    assert tearing(instants, 6) < 1e-6
+    instants = torch.rand(3, 40, 3, generator=generator(0, 3))
+    expected = tearing(torch.cat([instants[:, :3], instants[:, 4:]], 1), 6)
+    assert expected > 0.01
+    instants[1, 3, 2] = float("nan")
+    assert tearing(instants, 6) == pytest.approx(expected)
+    instants[0] = float("inf")
+    assert tearing(instants, 6) == 0.0

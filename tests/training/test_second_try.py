@@ -149,9 +149,25 @@ def test_tearing_is_that_of_the_solid_spheres(device):
     flies[:, 3] *= 100.0
     state.motion.translations = lambda means, times: flies.to(means.device)
     assert second_try.torn_by(state) < 1e-6
+    assert state.motion.training
     with torch.no_grad():
         state.gaussians.opacity_logits[3] = 2.0
     assert second_try.torn_by(state) > 1e-4
+
+
+def test_tearing_does_not_depend_on_the_number_of_spheres(device):
+    """Two halves of a body slide along each other."""
+    state, random = TrainState.begin(CONFIG, tiny_dataset(6), device), torch.Generator().manual_seed(0)
+    times = torch.linspace(0.0, 1.0, second_try.INSTANTS)[:, None, None]
+    torn = []
+    for count in (600, 4800):
+        places = torch.rand(count, 3, generator=random).to(device)
+        state.gaussians.means = torch.nn.Parameter(places)
+        state.gaussians.opacity_logits = torch.nn.Parameter(torch.full((count,), 2.0, device=device))
+        upper = (places[:, 2:] > 0.5).cpu() * torch.tensor([1.0, 0.0, 0.0])
+        state.motion.translations = lambda means, _, upper=upper: (times * upper).to(means.device)
+        torn.append(second_try.torn_by(state))
+    assert torn[0] > 0.02 and torn[1] == pytest.approx(torn[0], rel=0.15)
 
 
 def test_what_is_asked_for_is_not_tried_again(tried, tmp_path, monkeypatch):
