@@ -39,7 +39,7 @@ MOST_LOSS = 1.0
 """PSNR in dB by which the second motion of one body may be worse if it tears the body less: firmer spheres show less
 detail."""
 TORN = 0.03
-"""Tearing from which a body counts as torn. Bodies whose limbs keep their places have a third to two thirds of it."""
+"""Tearing from which a body counts as torn. Bodies whose limbs keep their places have 0.002 to 0.022."""
 LESS_TORN = 0.75
 """Tearing of the second motion, relative to the first, below which it counts as less."""
 INSTANTS = 16

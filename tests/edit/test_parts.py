@@ -12,6 +12,7 @@ import torch
 from scipy.optimize import linear_sum_assignment
 
 from helpers.edit_scenes import bar_scene, figure_scene
+from helpers.jointed_rods import TIMES, chain, plain_width, same_partition
 from scgs_warp.data.synthetic.figure_motion import BONES, bone_transforms
 from scgs_warp.edit import EditSession, parts
 from scgs_warp.edit.joint_bands import Band, find_band, without_band
@@ -19,49 +20,9 @@ from scgs_warp.edit.joints import find_joints
 from scgs_warp.edit.parts import LEAST_TURN, find_parts, fit_parts, relative_turns
 from scgs_warp.edit.patches import Moments, Patches, make_patches
 from scgs_warp.edit.rotations import from_axis, rigid_fit, rotate, to_matrix
-from scgs_warp.edit.shared_motion import MOST_LOST, MOST_OFF, find_shared
+from scgs_warp.edit.shared_motion import find_shared
 from scgs_warp.edit.skeleton_from_motion import observe
 from scgs_warp.runtime import environment
-
-TIMES = np.linspace(0.0, 1.0, 16)
-
-
-def chain(
-    angles: list[float], seed: int = 0, noise: float | list[float] = 0.0
-) -> tuple[Patches, np.ndarray, np.ndarray]:
-    """A rod along x of segments of length 1. Each segment swings about a joint at its start: the first about y, the
-    next about z, and so on, by these angles in degrees between two instants. Patches are 10 along each segment, 60
-    Gaussians each, with noise on their tracks, for all or for each segment. Returns patches, the segment of each patch,
-    and the joints at rest."""
-    random = np.random.default_rng(seed)
-    count = 600 * (len(angles) + 1)
-    rest = random.random((count, 3)) * [len(angles) + 1, 0.3, 0.3] - [0.0, 0.15, 0.15]
-    segment = rest[:, 0].astype(int)
-    off = np.broadcast_to(noise, len(angles) + 1)[segment][:, None]
-    tracks = []
-    for time in TIMES:
-        points, place = rest.copy(), np.eye(4)
-        for index in range(len(angles)):
-            degrees = angles[index] * 0.5 * (1.0 - math.cos(2.0 * math.pi * time))
-            turn = np.eye(4)
-            turn[:3, :3] = to_matrix(from_axis((0, 1, 0) if index % 2 == 0 else (0, 0, 1), degrees))
-            there = np.eye(4)
-            there[0, 3] = index + 1.0
-            place = place @ there @ turn @ np.linalg.inv(there)
-            own = segment == index + 1
-            points[own] = rest[own] @ place[:3, :3].T + place[:3, 3]
-        tracks.append(points + off * random.normal(size=points.shape))
-    at = rest[:, 0] * 10.0 - 0.5
-    low = np.floor(at).clip(0, 10 * (len(angles) + 1) - 2)
-    indices = np.stack([low, low + 1], 1).astype(np.int64)
-    share = (at - low).clip(0.0, 1.0)
-    patches = make_patches(np.stack(tracks), indices, np.stack([1.0 - share, share], 1))
-    joints = np.array([[index + 1.0, 0.0, 0.0] for index in range(len(angles))])
-    return patches, np.arange(10 * (len(angles) + 1)) // 10, joints
-
-
-def same_partition(first: np.ndarray, second: np.ndarray) -> bool:
-    return len(set(zip(first.tolist(), second.tolist()))) == len(set(first.tolist())) == len(set(second.tolist()))
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
@@ -168,88 +129,6 @@ def test_bones_between_two_others_remain(cuts, joints, angles):
     assert same_partition(find_parts(patches), piece)
 
 
-@pytest.mark.parametrize(
-    "degrees, noise, parts_found", [(30.0, 0.0, 2), (30.0, 0.005, 2), (30.0, 0.05, 1), (60.0, 0.05, 2)]
-)
-def test_a_turn_that_the_motion_hardly_shows_is_no_joint(degrees, noise, parts_found):
-    patches, segment, _ = chain([degrees], noise=noise)
-    pooled, motions = fit_parts(patches.moments, segment)
-    assert math.degrees(relative_turns(pooled, motions, np.array([[0, 1]]))[0]) > 20.0, "the turn alone is a joint"
-    assert find_parts(patches).max() + 1 == parts_found
-    assert find_parts(patches, 2).max() + 1 == 2, "two are asked for"
-
-
-def test_a_well_known_part_beside_a_badly_known_one_keeps_its_joint():
-    """Most of the body is noisy, so that the turn of its end is small beside the distance of a typical patch; but the
-    end's own motion explains it far better."""
-    patches, segment, _ = chain([60.0, 60.0, 40.0], noise=[0.2, 0.2, 0.2, 0.01])
-    pairs, fits = np.array([[0, 1], [1, 2], [2, 3]]), fit_parts(patches.moments, segment)
-    own = patches.moments.errors_under(fits[1])[np.arange(len(segment)), segment]
-    far = np.flatnonzero(segment == 3)
-    both = patches.moments.take(np.flatnonzero(segment >= 2))
-    errors = both.errors_under(fit_parts(both, np.zeros(20, np.int64))[1])[10:, 0]
-    lost = errors.sum() / own[far].sum(), errors.mean() / np.median(own)
-    assert lost[0] > MOST_LOST**2 and lost[1] < MOST_OFF**2, "the second bound alone would merge it"
-    assert find_shared(patches.moments, segment, fits[1], pairs[2:], np.ones(1), fit_parts) is None
-
-
-def test_of_several_pairs_the_one_that_shares_its_motion_best_is_merged():
-    patches, segment, _ = chain([60.0, 20.0, 25.0], noise=0.02)
-    pairs, motions = np.array([[0, 1], [1, 2], [2, 3]]), fit_parts(patches.moments, segment)[1]
-    assert find_shared(patches.moments, segment, motions, pairs, np.ones(3), fit_parts) == 1
-    assert find_shared(patches.moments, segment, motions, pairs[[0, 2]], np.ones(2), fit_parts) == 1
-    assert find_shared(patches.moments, segment, motions, pairs[:1], np.ones(1), fit_parts) is None
-
-
-def test_two_badly_known_parts_of_a_well_known_body_do_not_merge():
-    """One motion explains both nearly as well as their own do, but not as well as others explain theirs."""
-    patches, segment, _ = chain([60.0, 60.0, 60.0, 40.0], noise=[0.01, 0.01, 0.01, 0.2, 0.2])
-    last, motions = np.array([[3, 4]]), fit_parts(patches.moments, segment)[1]
-    own = patches.moments.errors_under(motions)[np.arange(len(segment)), segment]
-    both = patches.moments.take(np.flatnonzero(segment >= 3))
-    errors = both.errors_under(fit_parts(both, np.zeros(20, np.int64))[1])[:, 0]
-    assert errors.sum() < MOST_LOST**2 * own[segment >= 3].sum() and errors.mean() > MOST_OFF**2 * np.median(own)
-    assert find_shared(patches.moments, segment, motions, last, np.ones(1), fit_parts) is None
-
-
-def plain_width(edges: np.ndarray, labels: np.ndarray, pair: np.ndarray) -> float:
-    """Count the edges between two parts, one after the other."""
-    crossing = sum({labels[a], labels[b]} == set(pair.tolist()) for a, b in edges.tolist())
-    neighbors = sum((edges == patch).sum() for patch in range(len(labels))) / len(labels)
-    area = min(int((labels == part).sum()) for part in pair)
-    return crossing / (neighbors / 3.0) / math.sqrt(area) / parts.USUAL_WIDTH
-
-
-def grid_edges(rows: int, columns: int) -> np.ndarray:
-    """Edges of a surface of rows x columns patches, each with six neighbours but at its ends; rows are closed, as
-    around a limb."""
-    at = np.arange(rows * columns).reshape(rows, columns)
-    beside = np.roll(at, -1, axis=1)
-    pairs = [(at, beside), (at[:-1], at[1:]), (at[:-1], beside[1:])]
-    return np.concatenate([np.stack([first.ravel(), second.ravel()], 1) for first, second in pairs])
-
-
-@pytest.mark.parametrize("length", [4, 12, 40])
-def test_boundaries_are_as_wide_as_they_are_long_for_their_parts(length):
-    """Around a limb of 8 patches, a boundary is as long as the root of the ratio of girth and length, relative to the
-    root of the smaller part's area."""
-    labels = np.repeat([0, 1], [8 * length, 8 * 60])
-    edges = grid_edges(length + 60, 8)
-    (width,) = parts._widths(edges, labels, np.array([[0, 1]]))
-    assert width == pytest.approx(plain_width(edges, labels, np.array([0, 1])))
-    assert width * parts.USUAL_WIDTH == pytest.approx(math.sqrt(8 / length), rel=0.02)
-
-
-def test_widths_are_those_of_each_pair():
-    """Three rings of a tube: the third and the first do not touch; the order of an edge's ends does not matter."""
-    edges, labels = grid_edges(12, 5), np.repeat([2, 0, 1], [10, 20, 30])
-    pairs = np.array([[0, 1], [0, 2], [1, 2]])
-    expected = [plain_width(edges, labels, pair) for pair in pairs]
-    np.testing.assert_allclose(parts._widths(edges, labels, pairs), expected)
-    np.testing.assert_allclose(parts._widths(edges[:, ::-1], labels, pairs), expected)
-    assert expected[0] > 0.0 and expected[2] == 0.0
-
-
 def merged_plainly(patches: Patches) -> np.ndarray:
     """Merge as ``find_parts`` does, every round and every fit anew."""
     labels = parts._merge_by_cost(patches, parts.FIRST_PARTS)
@@ -304,92 +183,6 @@ def test_whole_periods_are_left_out(seed):
     while (rounds := parts._without_repetition(rounds, bytes([state]), met)) > 0:
         state, rounds, made = int(follows[state]), rounds - 1, made + 1
     assert state == expected and made < 24
-
-
-@pytest.mark.parametrize(
-    "degrees, noise, decides",
-    [([50.0], [0.01, 0.01], "lost"), ([60.0, 60.0, 60.0, 40.0], [0.01, 0.01, 0.01, 0.2, 0.2], "off")],
-)
-def test_doubt_raises_both_limits_of_a_shared_motion(degrees, noise, decides):
-    patches, segment, _ = chain(degrees, noise=noise)
-    pair, motions = np.array([len(degrees) - 1, len(degrees)]), fit_parts(patches.moments, segment)[1]
-    own = patches.moments.errors_under(motions)[np.arange(len(segment)), segment]
-    rows = np.flatnonzero(segment >= pair[0])
-    both = patches.moments.take(rows)
-    errors = both.errors_under(fit_parts(both, np.zeros(len(rows), np.int64))[1])[:, 0]
-    mine = [segment[rows] == part for part in pair]
-    lost = max(errors[each].sum() / own[rows][each].sum() for each in mine)
-    off = max(errors[each].sum() / both.count[each].sum() for each in mine) / np.median(own / patches.moments.count)
-    needed = {"lost": math.sqrt(lost) / MOST_LOST, "off": math.sqrt(off) / MOST_OFF}
-    least = max(needed.values())
-    assert needed[decides] == least > 1.2, "without doubt the parts stay apart"
-    for doubt, row in ((0.98 * least, None), (1.02 * least, 0)):
-        assert find_shared(patches.moments, segment, motions, pair[None], np.array([doubt]), fit_parts) == row
-
-
-def test_of_several_doubted_pairs_the_one_with_the_least_distance_for_its_doubt_is_merged():
-    patches, segment, _ = chain([60.0, 20.0, 25.0], noise=0.02)
-    pairs, motions = np.array([[0, 1], [1, 2], [2, 3]]), fit_parts(patches.moments, segment)[1]
-    assert find_shared(patches.moments, segment, motions, pairs, np.array([1.0, 1.0, 3.0]), fit_parts) == 2
-
-
-def two_halves(degrees: float, waist: int) -> np.ndarray:
-    """Labels found in a sheet of 8 x 24 patches whose halves, 4 x 24 each, turn against each other. Of the 24 patches
-    along their boundary, ``waist`` are joined across it."""
-    rest = np.random.default_rng(0).random((192 * 25, 3)) * [8.0, 24.0, 0.0]
-    nearest = rest[:, 0].astype(np.int64) * 24 + rest[:, 1].astype(np.int64)
-    pivot, tracks = np.array([4.0, 12.0, 0.0]), []
-    for time in TIMES:
-        turn = from_axis((0, 0, 1), degrees * 0.5 * (1.0 - math.cos(2.0 * math.pi * time)))
-        tracks.append(np.where(rest[:, :1] > 4.0, rotate(turn, rest - pivot) + pivot, rest))
-    patches = make_patches(np.stack(tracks), nearest[:, None], np.ones((len(rest), 1)))
-    at = np.arange(192).reshape(8, 24)
-    edges = [np.stack([at[:, :-1].ravel(), at[:, 1:].ravel()], 1), np.stack([at[3, :waist], at[4, :waist]], 1)]
-    edges += [np.stack([half[:-1].ravel(), half[1:].ravel()], 1) for half in (at[:4], at[4:])]
-    return find_parts(patches._replace(edges=np.concatenate(edges)))
-
-
-def test_narrow_boundaries_are_joints_at_smaller_angles():
-    assert two_halves(12.5, waist=2).max() == 1
-    assert two_halves(12.5, waist=24).max() == 0
-    assert two_halves(9.0, waist=2).max() == 0
-    patches, _, _ = chain([9.0, 30.0])
-    assert find_parts(patches).max() == 1
-    patches, _, _ = chain([3.0, 2.0])
-    assert find_parts(patches).max() == 0
-    assert math.degrees(LEAST_TURN) == pytest.approx(15)
-
-
-def test_a_joint_at_a_small_angle_is_a_joint_like_any_other():
-    patches, segment, joints = chain([13.0])
-    labels = find_parts(patches)
-    assert same_partition(labels, segment)
-    (joint,) = [joint for joint in find_joints(patches, labels) if joint.parent >= 0]
-    assert np.linalg.norm((joint.point - joints[0])[[0, 2]]) < 0.03 and joint.confidence > 0.5
-    assert joint.axis is not None and abs(joint.axis[1]) > math.cos(math.radians(10))
-
-
-def test_the_doubt_of_a_wide_boundary_is_limited(monkeypatch):
-    """Two rows of patches lie side by side."""
-    asked: list[float] = []
-
-    def shared(moments, labels, motions, pairs, doubt, fit):
-        asked.extend(doubt.tolist())
-
-    monkeypatch.setattr(parts, "find_shared", shared)
-    monkeypatch.setattr(parts, "relative_turns", lambda *args: np.radians([60.0]))
-    nearest = np.repeat(np.arange(160), 9)
-    rest = np.stack([nearest // 80, nearest % 80, 0 * nearest], 1) + np.random.default_rng(0).random((1440, 3))
-    patches = make_patches(np.stack([rest] * len(TIMES)), nearest[:, None], np.ones((len(rest), 1)))
-    at = np.arange(160).reshape(2, 80)
-    edges = [np.stack([at[:, :-1].ravel(), at[:, 1:].ravel()], 1), at.T]
-    patches = patches._replace(edges=np.concatenate(edges))
-    labels = np.repeat([0, 1], 80)
-    monkeypatch.setattr(parts, "_merge_by_cost", lambda patches, count: labels)
-    monkeypatch.setattr(parts, "_refined", lambda patches, labels, fits: labels)
-    find_parts(patches)
-    width = parts._widths(patches.edges, labels, np.array([[0, 1]]))[0]
-    assert width > parts.MOST_DOUBT and asked == [parts.MOST_DOUBT]
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 6])
