@@ -5,9 +5,10 @@ move no further than the images require. The second try adds frame after frame, 
 the frame before, and ties each sphere to its neighbours at that moment (``rigidity.momentary_graph``). Its spheres are
 kept if they show the training views better: bodies that truly part fit the second try worse.
 
-Where limbs have exchanged their places halfway, training views are shown as well as by the true motion, or better. But
-then the body is torn: what belongs together at one moment is far apart at another. If the subject may be one body and
-the first motion tears it, a second one that tears it less is kept, unless it shows the views clearly worse.
+Training views alone do not decide. A round head that does not turn, or limbs that have exchanged their places halfway,
+show them as well as the true motion does, or better. But then the body is torn: what belongs together at one moment is
+apart at another. If the subject may be one body, a second motion that tears it less is therefore also kept where both
+show the views alike, and where the first tears the body much, unless the second shows the views clearly worse.
 """
 
 from __future__ import annotations
@@ -34,12 +35,14 @@ from .state import StepResult, TrainState
 VIEWS = 200
 """Largest number of training views by which both tries are compared."""
 LEAST_GAIN = 0.1
-"""PSNR in dB by which the second motion must be better: a smaller gain in stage 1 may be chance."""
+"""PSNR in dB by which the second motion must be better to be kept for that alone: a smaller gain may be chance."""
+CHANCE = 0.25
+"""PSNR in dB by which the second motion of one body may be worse if it tears the body less: with other frames left out,
+the difference between both changes by about as much."""
 MOST_LOSS = 1.0
-"""PSNR in dB by which the second motion of one body may be worse if it tears the body less: firmer spheres show less
-detail."""
+"""The same where the first motion tears the body much: firmer spheres show less detail."""
 TORN = 0.03
-"""Tearing from which a body counts as torn. Bodies whose limbs keep their places have 0.002 to 0.022."""
+"""Tearing that counts as much. Bodies whose limbs keep their places have 0.002 to 0.022."""
 LESS_TORN = 0.75
 """Tearing of the second motion, relative to the first, below which it counts as less."""
 INSTANTS = 16
@@ -106,7 +109,8 @@ def try_again(
     better, reason = after > before + LEAST_GAIN, ""
     if not better and after > before - MOST_LOSS and is_one_piece(frames.frames):
         torn = torn_by(state), torn_by(second)
-        better = torn[0] > TORN and torn[1] < LESS_TORN * torn[0]
+        most = MOST_LOSS if torn[0] > TORN else CHANCE
+        better = after > before - most and torn[1] < LESS_TORN * torn[0]
         reason = f": it tears the body less ({torn[1]:.3f}, not {torn[0]:.3f})" if better else ""
     if state.group is not None:  # the first process decides: others may round differently
         better = state.group.any(state.group.first and better)
