@@ -10,11 +10,13 @@ against their parent count as one with it. Parts and bones are matched one to on
 bone, or another bone than the point's, disagrees.
 
 Rows hold `run` and `bone`. Those of bone `all` hold the run's `agreement`, `parts`, `bones`, processor `seconds` of
-finding them, and `tracked`: the share of points whose nearest Gaussian moves, in the trained motion, more like the true
-bone than like any other. A surface that looks the same however it turns, such as a ball at a joint, need not. Rows of
-bones hold the same for their own `points` (share of all), their `turn` against their parent, and `trained_turn`, that
-of the Gaussians nearest to their points. Where the joint was found they hold `joint_error` in percent of the height,
-and `axis_error` in degrees if both the truth and the run have an axis and the bone turns by more than 20 degrees.
+finding them; `seen_agreement`, for which each point counts as often as a training view sees it, with the Gaussian that
+is nearest to it then; and `tracked`: the share of points whose nearest Gaussian moves, in the trained motion, more like
+the true bone than like any other. A surface that looks the same however it turns, such as a ball at a joint, need not.
+Rows of bones hold the same for their own `points` (share of all), their `turn` against their parent, and
+`trained_turn`, that of the Gaussians nearest to their points. Where the joint was found they hold `joint_error` in
+percent of the height, and `axis_error` in degrees if both the truth and the run have an axis and the bone turns by more
+than 20 degrees.
 """
 
 from __future__ import annotations
@@ -32,6 +34,7 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 from scipy.spatial import cKDTree
 
+from scgs_warp.data import load
 from scgs_warp.data.gltf.scene import read_scene
 from scgs_warp.data.synthetic.figure_motion import BONES, bone_transforms
 from scgs_warp.data.synthetic.from_mesh import span_of
@@ -42,6 +45,7 @@ from scgs_warp.edit.rotations import from_matrix, logarithm, rigid_fit, to_matri
 from scgs_warp.runtime.environment import configure
 from scgs_warp.runtime.provenance import command_line, provenance
 from scgs_warp.scene.scene import Scene
+from scgs_warp.types import Gaussians
 
 LEAST_TURN, LEAST_AXIS_TURN = 15.0, 20.0
 """Degrees."""
@@ -134,6 +138,7 @@ class Surface(NamedTuple):
 def rows_of(run: Path, bones: Bones, data: Path) -> list[dict[str, Any]]:
     with np.load(data / "ground_truth.npz") as truth:
         seen = truth["visible"].any(0)
+        visible = truth["visible"][:, seen]
         points, times, height = truth["points"][:, seen].astype(np.float64), truth["times"], float(truth["height"])
     turns = [largest_turn(relative_turns(bones, b)) if p >= 0 else 180.0 for b, p in enumerate(bones.parents)]
     whole = list(range(len(bones.names)))
@@ -150,10 +155,15 @@ def rows_of(run: Path, bones: Bones, data: Path) -> list[dict[str, Any]]:
     np.add.at(table, (surface.part, surface.bone), 1)
     parts, own = linear_sum_assignment(-table)
     matched = {int(b): int(p) for p, b in zip(parts, own) if table[p, b] > 0}
+    bone_of = np.full(len(skeleton.parts), -1)
+    bone_of[parts] = own
+    shown_at = [frame.time for frame in load(data).entries]
+    counts = counts_of(visible, np.array(shown_at), times)
     rows: list[dict[str, Any]] = [{
         "run": run.name, "bone": "all", "agreement": float(table[parts, own].sum() / len(surface.bone)),
         "parts": len(skeleton.parts), "bones": len(np.unique(surface.bone)), "seconds": seconds,
         "tracked": float((surface.tracked == surface.bone).mean()),
+        "seen_agreement": seen_agreement(session, bone_of, surface.bone, points, times, counts),
     }]  # fmt: skip
     start = bones.at(0.0)
     for bone in np.unique(surface.bone).tolist():
@@ -179,15 +189,54 @@ def rows_of(run: Path, bones: Bones, data: Path) -> list[dict[str, Any]]:
     return rows
 
 
+def counts_of(visible: np.ndarray, shown_at: np.ndarray, times: np.ndarray) -> np.ndarray:
+    """Return in how many views each point is seen nearest to each of ``times``, [T, P].
+
+    Args:
+        visible: [V, P] whether a view shows a point.
+        shown_at: [V] times of the views.
+    """
+    counts = np.zeros((len(times), visible.shape[1]), np.int64)
+    np.add.at(counts, np.abs(shown_at[:, None] - times).argmin(1), visible)
+    return counts
+
+
+def seen_agreement(
+    session: EditSession,
+    bone_of: np.ndarray,
+    bone: np.ndarray,
+    points: np.ndarray,
+    times: np.ndarray,
+    counts: np.ndarray,
+) -> float:
+    """Return the share of seen points whose nearest Gaussian at that instant belongs to the part of their bone.
+
+    Args:
+        bone_of: bone of each part, -1: none.
+        bone: [P] true bone of each point.
+        points: [T, P, 3]
+        counts: [T, P] in how many views each is seen.
+    """
+    right, parts = 0, session.gaussian_parts()
+    for time_, places, count in zip(times, points, counts):
+        nearest = nearest_gaussians(session.scene.gaussians_at(float(time_)), places)
+        right += int(count[bone_of[parts[nearest]] == bone].sum())
+    return right / int(counts.sum())
+
+
+def nearest_gaussians(gaussians: Gaussians, points: np.ndarray) -> np.ndarray:
+    """Return the opaque Gaussian nearest to each of ``points`` [P, 3]."""
+    solid = np.flatnonzero((gaussians.opacities > 0.5).cpu().numpy())
+    return solid[cKDTree(gaussians.means.double().cpu().numpy()[solid]).query(points)[1]]
+
+
 def _surface(session: EditSession, bones: Bones, whole: np.ndarray, points: np.ndarray, times: np.ndarray) -> Surface:
     """Compare the true surface's tracks [T, P, 3] with the nearest Gaussians.
 
     Args:
         whole: [B] the bone as which each counts.
     """
-    gaussians = session.scene.gaussians_at(float(times[0]))
-    solid = np.flatnonzero((gaussians.opacities > 0.5).cpu().numpy())
-    nearest = solid[cKDTree(gaussians.means.double().cpu().numpy()[solid]).query(points[0])[1]]
+    nearest = nearest_gaussians(session.scene.gaussians_at(float(times[0])), points[0])
     instants = times[np.linspace(0, len(times) - 1, COMPARED).astype(int)]
     tracks = np.stack([session.scene.gaussians_at(float(t)).means[nearest].double().cpu().numpy() for t in instants])
     return Surface(

@@ -53,11 +53,11 @@ def parts_found(results: Results) -> str:
             axes = sorted(row["axis_error"] for row in own if "axis_error" in row)
             lines.append([
                 whole["run"], f"{100 * whole['agreement']:.0f} %",
-                f"{100 * whole['tracked']:.0f} %" if "tracked" in whole else "", f"{whole['parts']} ({whole['bones']})",
+                _share(whole, "seen_agreement"), _share(whole, "tracked"), f"{whole['parts']} ({whole['bones']})",
                 _spread(joints, " %"), _spread(axes, "°"), f"{whole['seconds']:.1f} s",
             ])  # fmt: skip
     head = [
-        "run", "surface", "trained motion", "parts (bones)", "joints off: median, largest",
+        "run", "surface", "surface as seen", "trained motion", "parts (bones)", "joints off: median, largest",
         "axes off: median, largest", "found in",
     ]  # fmt: skip
     return table(head, lines)
@@ -78,6 +78,10 @@ def bones_shown(results: Results) -> str:
         "trained: points that move with it, %", "parts: points that agree, %",
     ]  # fmt: skip
     return table(head, lines)
+
+
+def _share(row: dict[str, Any], name: str) -> str:
+    return f"{100 * row[name]:.0f} %" if name in row else ""
 
 
 def _spread(values: list[float], unit: str) -> str:

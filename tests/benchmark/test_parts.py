@@ -39,6 +39,26 @@ def test_a_motion_that_follows_the_bones_is_tracked(surface):
     assert len(np.unique(surface.part)) >= 12
 
 
+def test_views_count_at_the_instant_nearest_to_them():
+    visible = np.array([[True, False], [True, True], [False, True], [True, False]])
+    counts = parts.counts_of(visible, np.array([0.0, 0.1, 0.6, 1.0]), np.array([0.0, 0.5, 1.0]))
+    assert counts.tolist() == [[2, 1], [0, 1], [1, 0]]
+
+
+def test_points_count_as_often_as_they_are_seen():
+    """Points are those of the Gaussians themselves at three instants, so that each one's part is its own."""
+    session, times = EditSession(figure_scene(64)[0]), np.array([0.0, 0.4, 1.0])
+    chosen = np.arange(0, len(session.gaussian_parts()), 97)
+    places = np.stack([session.scene.gaussians_at(t).means[chosen].double().numpy() for t in times.tolist()])
+    own = session.gaussian_parts()[chosen]
+    bone_of = np.arange(int(session.gaussian_parts().max()) + 1) + 3
+    counts = np.random.default_rng(0).integers(0, 5, (3, len(chosen)))
+    wrong = np.arange(len(chosen)) % 4 == 0
+    bone = np.where(wrong, -7, own + 3)
+    found = parts.seen_agreement(session, bone_of, bone, places, times, counts)
+    assert found == pytest.approx(counts[:, ~wrong].sum() / counts.sum(), abs=0.02)
+
+
 def test_trained_turns_are_those_of_the_gaussians(surface):
     bones = parts.figure_bones()
     knee, hip = bones.names.index("knee_left"), bones.names.index("hip_left")
