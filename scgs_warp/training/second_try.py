@@ -7,8 +7,9 @@ kept if they show the training views better: bodies that truly part fit the seco
 
 Training views alone do not decide. A round head that does not turn, or limbs that have exchanged their places halfway,
 show them as well as the true motion does, or better. But then the body is torn: what belongs together at one moment is
-apart at another. If the subject may be one body, a second motion that tears it less is therefore also kept where both
-show the views alike, and where the first tears the body much, unless the second shows the views clearly worse.
+apart at another. If the subject may be one body, a second motion that tears it far less is therefore also kept where
+both show the views alike. Where the first tears the body much, one that tears it less is kept, unless it shows the
+views clearly worse.
 """
 
 from __future__ import annotations
@@ -37,14 +38,15 @@ VIEWS = 200
 LEAST_GAIN = 0.1
 """PSNR in dB by which the second motion must be better to be kept for that alone: a smaller gain may be chance."""
 CHANCE = 0.25
-"""PSNR in dB by which the second motion of one body may be worse if it tears the body less: with other frames left out,
-the difference between both changes by about as much."""
+"""PSNR in dB by which the second motion of one body may be worse if it tears the body far less: with other frames left
+out, the difference between both changes by about as much."""
 MOST_LOSS = 1.0
-"""The same where the first motion tears the body much: firmer spheres show less detail."""
+"""The same if the first motion tears the body much and the second less: firmer spheres show less detail."""
 TORN = 0.03
 """Tearing that counts as much. Bodies whose limbs keep their places have 0.002 to 0.022."""
-LESS_TORN = 0.75
-"""Tearing of the second motion, relative to the first, below which it counts as less."""
+LESS, FAR_LESS = 0.75, 0.4
+"""Tearing of the second motion, relative to the first, below which it counts as less and far less. Of two motions that
+are right, the firmer one has about half."""
 INSTANTS = 16
 """Number of instants at which tearing is measured."""
 SOLID = 0.1
@@ -109,8 +111,8 @@ def try_again(
     better, reason = after > before + LEAST_GAIN, ""
     if not better and after > before - MOST_LOSS and is_one_piece(frames.frames):
         torn = torn_by(state), torn_by(second)
-        most = MOST_LOSS if torn[0] > TORN else CHANCE
-        better = after > before - most and torn[1] < LESS_TORN * torn[0]
+        most, less = (MOST_LOSS, LESS) if torn[0] > TORN else (CHANCE, FAR_LESS)
+        better = after > before - most and torn[1] < less * torn[0]
         reason = f": it tears the body less ({torn[1]:.3f}, not {torn[0]:.3f})" if better else ""
     if state.group is not None:  # the first process decides: others may round differently
         better = state.group.any(state.group.first and better)
