@@ -1,9 +1,11 @@
 """Writers of the tables of docs/editing.md on parts and poses. Runs are those of the built-in figure with three seeds,
-of the default number of steps (``fig``) and of six times as many (``long``):
+of the default number of steps (``fig``) and of six times as many (``long``), and with ``cpu``:
 
     python apps/train.py --preset quick --seed S --threads 1 --output fig-S
     python benchmarks/parts.py --run fig-0 fig-1 fig-2 --data data/figure --json benchmarks/results/parts-figure.json
     python benchmarks/posing.py --run fig-0 fig-1 fig-2 --json benchmarks/results/posing-figure.json
+    python apps/train.py --preset cpu --seed S --threads 1 --output cpu-S
+    python benchmarks/parts.py --run cpu-0 cpu-1 --data data/figure --json benchmarks/results/parts-cpu.json
     python apps/train.py --preset quick --steps 42000 --seed S --device cuda --output long-S
     python benchmarks/parts.py --run long-0 long-1 long-2 --data data/figure --json benchmarks/results/parts-long.json
     python benchmarks/posing.py --run long-0 long-1 long-2 --json benchmarks/results/posing-long.json

@@ -205,7 +205,7 @@ REPEATABLE = {
     ),
     "posing-parts": Repeatable(
         parts_found,
-        ("parts-figure", "parts-long", "parts-long-cpu", "parts-man", "parts-robot", "parts-robot-walk"),
+        ("parts-figure", "parts-cpu", "parts-long", "parts-long-cpu", "parts-man", "parts-robot", "parts-robot-walk"),
         EDITING,
     ),
     "posing-bones": Repeatable(bones_shown, ("parts-long",), EDITING),
