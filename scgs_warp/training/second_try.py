@@ -109,7 +109,7 @@ def try_again(
     check_replicas(second)
     before, after = shown_psnr(state, frames.frames), shown_psnr(second, frames.frames)
     better, reason = after > before + LEAST_GAIN, ""
-    if not better and after > before - MOST_LOSS and is_one_piece(frames.frames):
+    if not better and is_one_piece(frames.frames):
         torn = torn_by(state), torn_by(second)
         most, less = (MOST_LOSS, LESS) if torn[0] > TORN else (CHANCE, FAR_LESS)
         better = after > before - most and torn[1] < less * torn[0]
