@@ -102,3 +102,27 @@ def test_the_doubt_of_a_wide_boundary_is_limited(monkeypatch):
     find_parts(patches)
     width = parts._widths(patches.edges, labels, np.array([[0, 1]]))[0]
     assert width > parts.MOST_DOUBT and asked == [parts.MOST_DOUBT]
+
+
+def test_each_pair_has_the_doubt_of_its_own_boundary(monkeypatch):
+    """Three pieces of a sheet: between the first two, which turn far, one edge is left."""
+    asked: list[tuple[list[int], float]] = []
+
+    def shared(moments, labels, motions, pairs, doubt, fit):
+        asked.extend(zip(pairs.tolist(), doubt.tolist()))
+
+    monkeypatch.setattr(parts, "find_shared", shared)
+    monkeypatch.setattr(parts, "find_band", lambda *args: None)
+    monkeypatch.setattr(parts, "relative_turns", lambda *args: np.radians([120.0, 60.0]))
+    nearest = np.repeat(np.arange(240), 9)
+    rest = np.stack([nearest // 80, nearest % 80, 0 * nearest], 1) + np.random.default_rng(0).random((2160, 3))
+    patches = make_patches(np.stack([rest] * len(TIMES)), nearest[:, None], np.ones((len(rest), 1)))
+    at = np.arange(240).reshape(3, 80)
+    edges = [np.stack([at[:, :-1].ravel(), at[:, 1:].ravel()], 1), at[:2, :1].T, at[1:].T]
+    patches = patches._replace(edges=np.concatenate(edges))
+    labels = np.repeat([0, 1, 2], 80)
+    monkeypatch.setattr(parts, "_merge_by_cost", lambda patches, count: labels)
+    monkeypatch.setattr(parts, "_refined", lambda patches, labels, fits: labels)
+    find_parts(patches)
+    narrow, wide = parts._widths(patches.edges, labels, np.array([[0, 1], [1, 2]]))
+    assert narrow < 1.0 < wide and asked == [([1, 2], min(wide, parts.MOST_DOUBT))]
