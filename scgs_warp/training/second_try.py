@@ -38,8 +38,8 @@ VIEWS = 200
 LEAST_GAIN = 0.1
 """PSNR in dB by which the second motion must be better to be kept for that alone: a smaller gain may be chance."""
 CHANCE = 0.25
-"""PSNR in dB by which the second motion of one body may be worse if it tears the body far less: with other frames left
-out, the difference between both changes by about as much."""
+"""PSNR in dB by which the second motion of one body may be worse if it tears the body far less. Leaving out an eighth
+of the frames changed the difference between both by 0.13 and 0.17 on two subjects."""
 MOST_LOSS = 1.0
 """The same if the first motion tears the body much and the second less: firmer spheres show less detail."""
 TORN = 0.03
