@@ -69,6 +69,28 @@ def test_a_part_is_renamed_by_key_double_click_and_palette(browser, editor):
     window.close()
 
 
+def test_a_double_click_holds_though_tracks_are_drawn_anew(browser, editor):
+    window = Window(browser, editor)
+    window.still()
+    page = window.page
+    name, place = window.choose_limb()
+    window.drag(place, (20, -30))
+    track = page.locator(f"#tracks [data-handle={name}]")
+    until(lambda: track.count() == 1)
+    box = track.bounding_box()
+    page.mouse.move(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
+    page.mouse.down()
+    page.mouse.up()
+    page.mouse.down(click_count=2)
+    window.ask("studio.link.ask('key', { at: 0.5 })")
+    until(lambda: page.locator("#tracks .key").count() > 1)
+    page.mouse.up(click_count=2)
+    assert page.locator("#newname").input_value() == name
+    name_it(window, "foot")
+    until(lambda: closed(window) and page.locator("#chosen").inner_text() == "foot")
+    window.close()
+
+
 def test_names_are_text_and_do_not_break_the_page(browser, editor):
     window = Window(browser, editor, size={"width": 390, "height": 844})
     window.still()

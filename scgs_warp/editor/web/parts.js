@@ -6,10 +6,13 @@ class PartChanges {
   constructor(studio) {
     this.studio = studio;
     element("chosen").addEventListener("click", () => this.rename());
-    element("tracks").addEventListener("dblclick", ({ target }) => {
-      const name = target.closest(".name")?.dataset.handle;
+    // The second press of a double click; its release meets no track that has been drawn anew meanwhile.
+    element("tracks").addEventListener("mousedown", (event) => {
+      const name = event.target.closest(".name")?.dataset.handle;
       const handle = this.state.handles.find((one) => one.name === name);
-      if (handle) this.rename(handle.part ?? handle.name, Boolean(handle.part));
+      if (!handle || event.detail !== 2) return;
+      event.preventDefault(); // the dialog keeps the focus
+      this.rename(handle.part ?? handle.name, Boolean(handle.part));
     });
     element("change").addEventListener("submit", (event) => {
       event.preventDefault();
