@@ -40,7 +40,7 @@ class Options:
     skeleton: bool = False
     """Print the parts that moved together, with their joints, and end (docs/editing.md)."""
     parts: int | None = None
-    """Number of parts, instead of as many as turn against their neighbours."""
+    """Number of parts to find, instead of the number that follows from the motion."""
     motion: Path | None = None
     """Motion to play on the scene's parts as keyframes: a run folder, or a glTF character (.glb, .gltf)."""
     clip: str | None = None

@@ -66,8 +66,8 @@ class Posing:
         """Return the parts that moved rigidly together over the trained motion, with their joints.
 
         Args:
-            count: number of parts; None: those of the edit's skeleton, by default as many as turn against their
-                neighbours.
+            count: number of parts; None: the parts of the edit's skeleton, or else of the run's, whose number follows
+                from the motion.
         """
         if count is None:
             return self.skeleton.parts
@@ -139,7 +139,7 @@ class Posing:
     # Posing
 
     def part_at(self, point: Sequence[float], time: float, at: float | None = None) -> str:
-        """Return the part of the surface at a point of the edited scene: of the opaque Gaussian nearest to it.
+        """Return the part to which the opaque Gaussian nearest to a point of the edited scene belongs.
 
         Args:
             point: [3], from ``pick`` for example.
@@ -181,7 +181,7 @@ class Posing:
         return self._motion_of(self.edit, part, time, at)[1]
 
     def turn(self, part: str, degrees: float, axis: Sequence[float] | None = None, time: float = 0.0) -> Target:
-        """Turn a part, and all that hangs on it, about its joint: further than it is, relative to its parent.
+        """Turn a part, with all that hangs on it, about its joint, relative to its parent. Repeated turns add up.
 
         Args:
             degrees: from -180 to 180.

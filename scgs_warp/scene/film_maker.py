@@ -1,4 +1,4 @@
-"""The place where a scene finds what films it. Films belong to a higher floor, which registers itself here."""
+"""Link from a scene to the code that films it. That code belongs to a higher layer, which registers itself here."""
 
 from __future__ import annotations
 

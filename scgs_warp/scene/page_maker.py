@@ -1,4 +1,5 @@
-"""The place where a scene finds what makes its page for notebooks; pages belong to a higher floor."""
+"""Link from a scene to the code that makes its page for notebooks. That code belongs to a higher layer, which registers
+itself here."""
 
 from __future__ import annotations
 

@@ -117,13 +117,13 @@ class Scene:
     ) -> bool:
         """Sample the motion once, so that later frames on a CPU interpolate it and need no network.
 
-        This asks the network for up to 2,049 instants, so it pays for playing a scene again and again, and not for a
-        film. The samples take 40 to 70 bytes for each instant and control point.
+        This evaluates the network at up to 2,049 instants: worthwhile if a scene is played again and again, but not for
+        a single film. The samples take 40 to 70 bytes for each instant and control point.
 
         Args:
             tolerance: largest error of a control point's position, as a share of the control points' extent, measured
                 in the middle between samples. The default is a third of a pixel where the subject is 1,000 pixels high.
-            tell: told how many of how many instants are sampled.
+            tell: called as ``tell(done, total)`` while instants are sampled.
 
         Returns:
             Whether the motion is interpolated. False: frames are as before, because the scene is on a GPU, its model
@@ -172,8 +172,8 @@ class Scene:
             time: clamped to [0, 1].
 
         Returns:
-            N Gaussians in world units on the scene's device. Row i is the same Gaussian at every time. Sharp ones are
-            approximated (``Gaussians.plain``).
+            N Gaussians in world units on the scene's device. Row i is the same Gaussian at every time. Those with a
+            sharpness above 0 are approximated by plain Gaussians (``Gaussians.plain``).
 
         Raises:
             UserError: the time is non-finite.
