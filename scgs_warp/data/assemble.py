@@ -19,6 +19,7 @@ from .borders import border_mask, reduce_mask
 from .cache import ImageCache, Pixels
 from .dataset import Dataset, StoredFrame, spread
 from .depth_maps import DepthFile, read_depth_map
+from .far_origin import offset_of
 from .images import Decoded, ReadOptions, decode, is_transparent, parallel_map, read_image, size_text
 from .lens import Lens
 from .points import finite_points
@@ -85,6 +86,13 @@ def assemble(
     Raises:
         UserError: one line naming the file, the field and the remedy.
     """
+    far = offset_of([record.viewmat for record in records])
+    if far is not None:
+        x, y, z = (f"{value:.0f}" for value in far)
+        raise UserError(
+            f"{folder}: the cameras are so far from the origin that 32-bit numbers do not tell them apart; subtract "
+            f"({x}, {y}, {z}) from the places of all cameras and points"
+        )
     cache = options.cache if options.cache is not None else ImageCache()
     keys = [object() for _ in records]
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import math
+import re
 import struct
 import warnings
 from collections.abc import Callable, Sequence
@@ -33,6 +34,11 @@ SMALLEST_SIDE = 8
 TRUSTED_PIXELS, MAX_PIXELS_PER_BYTE = 2**25, 64
 """Limits on the size that a file's header may announce. Up to ``TRUSTED_PIXELS`` any size is trusted, beyond it at most
 ``MAX_PIXELS_PER_BYTE`` for each byte of the file: a megabyte of zeros may decompress to a gigabyte."""
+
+JPEG_MARKER = re.compile(rb"\xff[^\x00\xff\xd0-\xd7]", re.DOTALL)
+"""A marker of JPEG; within the data of a scan, neither a byte that is escaped nor a restart."""
+JPEG_ALONE, JPEG_END = (0x01, 0xD8), 0xD9
+"""Markers that no segment follows, and the one at the end."""
 
 INSPECTED = 1024
 """Number of bytes by which a file that is no image is recognised."""
@@ -288,7 +294,7 @@ def is_complete(data: np.ndarray) -> bool:
     """
     content = data.tobytes()
     if content.startswith(b"\xff\xd8"):
-        return content.rfind(b"\xff\xd9") > content.rfind(b"\xff\xda")  # The end marker follows the last scan.
+        return _jpeg_ends(content)
     if content.startswith(b"\x89PNG\r\n\x1a\n"):
         at = 8
         while at + 8 <= len(content):
@@ -297,6 +303,19 @@ def is_complete(data: np.ndarray) -> bool:
             at += 12 + int.from_bytes(content[at : at + 4], "big")
         return False
     return len(content) > 0
+
+
+def _jpeg_ends(content: bytes) -> bool:
+    """Return whether a JPEG's end marker is reached from its beginning; what follows it, such as the film of a motion
+    photo, does not count."""
+    at = 2
+    while (found := JPEG_MARKER.search(content, at)) is not None:
+        kind, at = found[0][1], found.end()
+        if kind == JPEG_END:
+            return True
+        if kind not in JPEG_ALONE:
+            at += int.from_bytes(content[at : at + 2], "big")
+    return False
 
 
 def header_sizes(path: Path) -> list[tuple[int, int]]:

@@ -7,7 +7,7 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from helpers.films import mask_images, pan
+from helpers.films import mask_images, pan, stream
 from scgs_warp.capture.source import Video, open_source, rotate_image
 from scgs_warp.errors import UserError
 from scgs_warp.visualization.video import film, write_png
@@ -35,6 +35,15 @@ def test_pixels_are_made_square(tmp_path):
             container.mux(stream.encode(av.VideoFrame.from_ndarray(frame, format="rgb24")))
         container.mux(stream.encode())
     assert {still.image.shape for still in Video(tmp_path / "film.mp4").frames(1000)} == {(120, 192, 3)}
+
+
+def test_a_film_that_changes_its_size_is_usable_up_to_there(tmp_path):
+    (tmp_path / "call.h264").write_bytes(stream(pan(range(0, 60, 3), 120, 144)) + stream(pan(range(9), 60, 80)))
+    seen = []
+    with pytest.raises(UserError, match=r"call\.h264: its pictures are 144 x 120 pixels up to second .*, then 80 x 60"):
+        for still in Video(tmp_path / "call.h264").frames(200):
+            seen.append(still.image.shape)
+    assert len(seen) >= 15 and set(seen) == {(120, 144, 3)}
 
 
 def test_pictures_are_turned_as_they_were_held():

@@ -101,6 +101,20 @@ def test_truncated_images_are_told(tmp_path, suffix):
             assert not images.is_complete(np.fromfile(path, np.uint8))
 
 
+@pytest.mark.parametrize("options", [[], [cv2.IMWRITE_JPEG_PROGRESSIVE, 1], [cv2.IMWRITE_JPEG_RST_INTERVAL, 2]])
+def test_a_film_may_follow_a_photo(options):
+    """Motion photos: the film's bytes hold any marker, in any order."""
+    image = np.random.default_rng(0).integers(0, 256, (40, 60, 3), dtype=np.uint8)
+    data = cv2.imencode(".jpg", image, options)[1].tobytes()
+    thumbnail = b"\xff\xd8\xff\xda\x00\x02\xff\xd9"
+    data = data[:2] + b"\xff\xff\xe1" + (2 + len(thumbnail)).to_bytes(2, "big") + thumbnail + data[2:]
+    assert cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_COLOR).shape == image.shape
+    for film in (b"\xff\xda\x00", b"\xff\xd9\xff\xda", b"\xff"):
+        assert images.is_complete(np.frombuffer(data + film, np.uint8))
+    for end in (1, 2, 20, len(data) - len(thumbnail)):
+        assert not images.is_complete(np.frombuffer(data[:-end], np.uint8))
+
+
 def test_a_mask_hides_what_is_black(tmp_path):
     """The darkest grey is valid already, and so is a pixel of a single colour."""
     mask = np.array([[[0, 0, 0], [1, 1, 1], [0, 0, 2]], [[127, 127, 127], [255, 255, 255], [0, 0, 0]]], np.uint8)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import cv2
 import numpy as np
 
@@ -32,3 +34,29 @@ def mask_images(folder, count: int, size=(160, 120), name="{:03d}.png"):
         picture[10:30, 5 * index : 5 * index + 20] = 0
         write_png(folder / name.format(index), picture)
     return folder
+
+
+def stream(pictures: list[np.ndarray]) -> bytes:
+    """Pictures as an H.264 stream without a container; streams may follow each other."""
+    import av
+
+    height, width = pictures[0].shape[:2]
+    encoder = av.CodecContext.create("libx264", "w")
+    encoder.width, encoder.height, encoder.pix_fmt, encoder.framerate = width, height, "yuv420p", 10
+    frames = [av.VideoFrame.from_ndarray(picture, format="rgb24") for picture in pictures]
+    return b"".join(bytes(packet) for frame in [*frames, None] for packet in encoder.encode(frame))
+
+
+def cut_film(path: Path, to: Path, count: int) -> None:
+    """Cut a film's first ``count`` frames off without encoding it anew, as phones do: they stay, but are not shown."""
+    import av
+
+    options = {"use_editlist": "1", "avoid_negative_ts": "disabled"}
+    with av.open(str(path)) as film, av.open(str(to), "w", options=options) as out:
+        source = film.streams.video[0]
+        target = out.add_stream_from_template(source)
+        shift = round(count / source.average_rate / source.time_base)
+        for packet in film.demux(source):
+            if packet.size:
+                packet.pts, packet.dts, packet.stream = packet.pts - shift, packet.dts - shift, target
+                out.mux(packet)

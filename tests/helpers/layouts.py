@@ -187,7 +187,12 @@ def colmap_lens(model: str) -> tuple[list[float], Callable[[np.ndarray], np.ndar
 
 
 def write_colmap(
-    folder: Path, count: int = 14, model: str = "PINHOLE", text: bool = False, names: Callable[[int], str] | None = None
+    folder: Path,
+    count: int = 14,
+    model: str = "PINHOLE",
+    text: bool = False,
+    names: Callable[[int], str] | None = None,
+    origin: np.ndarray | float = 0.0,
 ) -> None:
     """A model that pycolmap writes, in sparse/0, with observations."""
     import pycolmap
@@ -197,11 +202,11 @@ def write_colmap(
     camera = pycolmap.Camera(model=model, width=WIDTH, height=HEIGHT, params=params, camera_id=7)
     reconstruction.add_camera_with_trivial_rig(camera)
     for point, color in zip(POINTS, COLORS):
-        reconstruction.add_point3D(point, pycolmap.Track(), color)
+        reconstruction.add_point3D(point + origin, pycolmap.Track(), color)
     for index in range(count):
         name = names(index) if names else f"frame_{index + 1}.png"
         view = viewmat(index)
-        pose = pycolmap.Rigid3d(pycolmap.Rotation3d(view[:3, :3]), view[:3, 3])
+        pose = pycolmap.Rigid3d(pycolmap.Rotation3d(view[:3, :3]), view[:3, 3] - view[:3, :3] @ (np.zeros(3) + origin))
         seen = [pycolmap.Point2D(np.array([3.0, 4.0])), pycolmap.Point2D(np.array([5.0, 6.0]))] * (index % 3)
         image = pycolmap.Image(name=name, camera_id=7, image_id=index + 1, points2D=seen)
         reconstruction.add_image_with_trivial_frame(image, pose)

@@ -27,12 +27,13 @@ def viewmat(index: int) -> np.ndarray:
     return look_at(eye, torch.zeros(3, dtype=torch.float64), up).numpy()
 
 
-def write_ply(path: Path, points: np.ndarray, colors: np.ndarray | None) -> None:
+def write_ply(path: Path, points: np.ndarray, colors: np.ndarray | None, origin: np.ndarray | float = 0.0) -> None:
+    points = points + origin
     lines = ["ply", "format ascii 1.0", f"element vertex {len(points)}"]
-    lines += [f"property float {axis}" for axis in "xyz"]
+    lines += [f"property double {axis}" for axis in "xyz"]
     lines += [f"property uchar {name}" for name in ("red", "green", "blue")] if colors is not None else []
     rows = points if colors is None else np.hstack([points, colors])
-    lines += ["end_header"] + [" ".join(f"{x:.9g}" for x in row) for row in rows]
+    lines += ["end_header"] + [" ".join(f"{x:.16g}" for x in row) for row in rows]
     path.write_text("\n".join(lines) + "\n")
 
 

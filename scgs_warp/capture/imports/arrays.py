@@ -24,6 +24,8 @@ from .stacks import Stack, members
 
 SMALLEST = 8
 """Smallest side of an image, pixels."""
+OVERSHOOT = 0.1
+"""How far colours may leave [0, 1], as resampling makes them."""
 
 
 class Layout(NamedTuple):
@@ -83,7 +85,7 @@ def read(path: Path) -> ImportedScene:
         pose = rigid(poses[index], f"{path}: {layout.poses}[{index}]")
         frames.append(
             ImportedFrame(
-                lambda index=index: _picture(pictures.at(index), channels_first),
+                lambda index=index: _picture(pictures.at(index), channels_first, f"{path}: {layout.images}[{index}]"),
                 np.linalg.inv(pose) if layout.camera_to_world else pose,
                 intrinsics(Ks[index], f"{path}: {layout.lens}[{index}]"),
                 float(index),
@@ -139,12 +141,15 @@ def _image_size(images: Stack) -> tuple[int, int, bool]:
     return height, width, first
 
 
-def _picture(values: np.ndarray, channels_first: bool) -> np.ndarray:
-    """Return a picture [H, W, 3] uint8 of bytes, or of numbers in [0, 1]."""
+def _picture(values: np.ndarray, channels_first: bool, place: str) -> np.ndarray:
+    """Return a picture [H, W, 3] uint8 of bytes, or of numbers in [0, 1]; ``place`` names it in an error."""
     image = np.moveaxis(values, 0, 2) if channels_first else values
     if image.dtype == np.uint8:
         return np.ascontiguousarray(image)
     finite = np.nan_to_num(_floats(image), nan=0.0, posinf=1.0, neginf=0.0)
+    least, most = float(finite.min()), float(finite.max())
+    if least < -OVERSHOOT or most > 1.0 + OVERSHOOT:
+        raise UserError(f"{place} goes from {least:g} to {most:g}; export bytes, or numbers in [0, 1]")
     return np.ascontiguousarray(np.rint(finite.clip(0.0, 1.0) * 255.0).astype(np.uint8))
 
 

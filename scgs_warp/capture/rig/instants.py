@@ -55,7 +55,7 @@ def frame_seconds(path: Path) -> np.ndarray:
                 raise UserError(f"{path}: holds no pictures; take it out of the folder")
             stream: Any = container.streams.video[0]
             rate = float(stream.average_rate or 30)
-            stamps = [packet.pts for packet in container.demux(stream) if packet.size]
+            stamps = [packet.pts for packet in container.demux(stream) if packet.size and not packet.is_discard]
             unit = float(stream.time_base)
     except (FFmpegError, OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or type(error).__name__

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
+from fractions import Fraction
 from functools import partial
 from pathlib import Path, PurePosixPath
 
@@ -12,12 +13,15 @@ from ...storage.safe_paths import inside
 from ..assemble import FrameRecord, assemble, video_border, with_points
 from ..choice import choose
 from ..dataset import Dataset
+from ..far_origin import moved, note, offset_of
 from ..held_out import held_out
 from ..images import ReadOptions, header_sizes, size_text
 from ..lens import Lens, make_lens
 from ..natural_order import natural
 from .colmap_model import ModelCamera, ModelImage, find_model, read_model
 
+SECONDS = re.compile(r"(?:.*[^0-9.])?([0-9]{1,15}\.[0-9]{1,15})")
+"""Names that end with a decimal."""
 MADE_FROM = "give the images that the model was made from, with their names"
 """What to do about missing images."""
 
@@ -48,10 +52,11 @@ def read(folder: Path, split: str, options: ReadOptions) -> Dataset:
     choice = choose(model_folder, files, times, options, _cameras(images), MADE_FROM)
     _check_sizes([files[index] for index in choice.indices], [lenses[index] for index in choice.indices])
     chosen = held_out(model_folder, choice.indices, split)
+    offset = offset_of([image.viewmat for image in images])
     records = [
         FrameRecord(
             files[index],
-            images[index].viewmat,
+            images[index].viewmat if offset is None else moved(images[index].viewmat, offset),
             choice.times[index],
             lenses[index],
             PurePosixPath(images[index].name).with_suffix("").as_posix().replace("/", "_"),
@@ -59,8 +64,10 @@ def read(folder: Path, split: str, options: ReadOptions) -> Dataset:
         for index in chosen
     ]
     border = video_border([files[index] for index in choice.indices], [times[index] for index in choice.indices])
-    data = assemble(records, options, folder=folder, split=split, border=border, notes=choice.notes)
-    return with_points(data, model.points, model.colors) if len(model.points) else data
+    notes = [*choice.notes, *([] if offset is None else [note(offset)])]
+    data = assemble(records, options, folder=folder, split=split, border=border, notes=notes)
+    points = model.points if offset is None else model.points - offset
+    return with_points(data, points, model.colors) if len(points) else data
 
 
 def _image_folder(folder: Path, model_folder: Path) -> Path:
@@ -97,13 +104,18 @@ def _fits(lens: Callable[[tuple[int, int]], Lens], size: tuple[int, int]) -> boo
 
 def times_from_names(names: list[str]) -> list[float]:
     """Return times in [0, 1]: from the last number in each name if all names have one and the numbers differ, else from
-    the order."""
-    digit_groups = [re.findall(r"[0-9]{1,15}", PurePosixPath(name).stem) for name in names]
+    the order. Names that end with decimals, such as ``1311868164.363181``, have their times in seconds."""
+    stems = [PurePosixPath(name).stem for name in names]
+    decimals = [SECONDS.fullmatch(stem) for stem in stems]
+    seconds = [Fraction(found[1]) for found in decimals if found]
+    digit_groups = [re.findall(r"[0-9]{1,15}", stem) for stem in stems]
     if all(digit_groups):
-        numbers = [int(digits[-1]) for digits in digit_groups]
+        numbers = [Fraction(digits[-1]) for digits in digit_groups]
+        if len(seconds) == len(names) and len({int(second) for second in seconds}) > 1:  # else, 2.9 comes before 2.10
+            numbers = seconds
         first, last = min(numbers), max(numbers)
         if last > first:
-            return [(number - first) / (last - first) for number in numbers]
+            return [float((number - first) / (last - first)) for number in numbers]
     return [index / max(len(names) - 1, 1) for index in range(len(names))]
 
 

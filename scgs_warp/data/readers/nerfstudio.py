@@ -23,6 +23,7 @@ from ..assemble import FrameRecord, assemble, video_border, with_points
 from ..choice import choose
 from ..dataset import Dataset
 from ..depth_maps import MILLIMETRE, DepthFile
+from ..far_origin import moved, note, offset_of
 from ..held_out import held_out
 from ..images import ReadOptions
 from ..natural_order import by_name
@@ -57,13 +58,22 @@ def read(folder: Path, split: str, options: ReadOptions) -> Dataset:
         read_distortion(path, {**content, **entry})
     choice = choose(path, files, times, options, [file.relative_to(folder).parent.as_posix() for file in files])
     chosen = _of_split(path, content, files, choice.indices, split)
-    records = [_record(path, folder, content, index, files[index], choice.times[index]) for index in chosen]
+    poses = {index: read_pose(path, index, entries[index]) for index in choice.indices}
+    offset = offset_of(list(poses.values()))
+    if offset is not None:
+        poses = {index: moved(pose, offset) for index, pose in poses.items()}
+    records = [
+        _record(path, folder, content, index, files[index], poses[index], choice.times[index]) for index in chosen
+    ]
     border = video_border([files[index] for index in choice.indices], [times[index] for index in choice.indices])
-    data = assemble(records, options, folder=folder, split=split, one_size=True, border=border, notes=choice.notes)
-    return with_points(data, *_points(path, folder, content, data.cameras))
+    notes = [*choice.notes, *([] if offset is None else [note(offset)])]
+    data = assemble(records, options, folder=folder, split=split, one_size=True, border=border, notes=notes)
+    return with_points(data, *_points(path, folder, content, data.cameras, np.zeros(3) if offset is None else offset))
 
 
-def _record(path: Path, folder: Path, content: dict[str, Any], index: int, file: Path, time: float) -> FrameRecord:
+def _record(
+    path: Path, folder: Path, content: dict[str, Any], index: int, file: Path, pose: np.ndarray, time: float
+) -> FrameRecord:
     entry = content["frames"][index]
     fields = {**content, **entry}
     mask = entry.get("mask_path")
@@ -71,7 +81,7 @@ def _record(path: Path, folder: Path, content: dict[str, Any], index: int, file:
         raise UserError(f"{path}: frames[{index}].mask_path is not text; name the mask's file or leave it out")
     return FrameRecord(
         file,
-        read_pose(path, index, entry),
+        pose,
         time,
         partial(read_lens, path, fields, index),
         file.stem,
@@ -127,26 +137,33 @@ def _of_split(path: Path, content: dict[str, Any], files: list[Path], indices: l
             raise UserError(
                 f"{path}: {name}_filenames names {item!r}, which no frame has as file_path; write it as the frame does"
             )
-    chosen = sorted({known[item] for item in listed} & set(indices))
+    named = {known[item] for item in listed}
+    if name == "train":  # what is held out is not trained on, though some exporters list all frames here
+        held = {known.get(item) for other in ("val", "test") for item in lists.get(other, []) if isinstance(item, str)}
+        if named <= held:
+            raise UserError(f"{path}: train_filenames are all among those of val or test; list others, too")
+        named -= held
+    chosen = sorted(named & set(indices))
     if not chosen:
         raise UserError(f"{path}: no frame of {name}_filenames is left; choose more frames, or restore their images")
     return chosen
 
 
 def _points(
-    path: Path, folder: Path, content: dict[str, Any], cameras: list[Camera]
+    path: Path, folder: Path, content: dict[str, Any], cameras: list[Camera], offset: np.ndarray
 ) -> tuple[np.ndarray | None, np.ndarray | None]:
-    """Read points [P, 3] in the frame of the poses and their colours [P, 3]; None if the file names no points."""
+    """Read points [P, 3] in the frame of the poses, less ``offset``, and their colours [P, 3]; None without points."""
     name = content.get("ply_file_path")
     if name is None:
         return None, None
     if not isinstance(name, str) or not name:
         raise UserError(f"{path}: ply_file_path is not text; name the file of points or leave it out")
     points, colors = read_points(inside(folder, name, f"{path}: ply_file_path"))
-    moved = _applied(path, content, points)
+    applied = _applied(path, content, points)
+    points = points - offset
     # Some writers apply the poses' transform to the points and some do not: keep the version that more cameras see.
-    if moved is not None and _seen(moved, cameras) > _seen(points, cameras):
-        points = moved
+    if applied is not None and _seen(applied - offset, cameras) > _seen(points, cameras):
+        points = applied - offset
     return points, colors
 
 

@@ -24,6 +24,7 @@ from ..images import ReadOptions, size_text
 from ..lens import Lens
 from ..natural_order import natural
 from ..points import read_points
+from .colmap_model import find_model
 from .transforms import SUFFIXES
 
 FILE = "poses_bounds.npy"
@@ -36,8 +37,11 @@ MAX_ASPECT_ERROR = 0.01
 
 
 def recognises(folder: Path) -> bool:
-    """Return whether the folder holds this layout."""
-    return (folder / FILE).is_file()
+    """Return whether the folder holds this layout, and not the COLMAP model of one camera's images, beside which LLFF
+    and others keep this file."""
+    images = folder / "images"
+    alone = images.is_dir() and any(file.suffix.lower() in SUFFIXES for file in images.iterdir() if file.is_file())
+    return (folder / FILE).is_file() and not (alone and find_model(folder) is not None)
 
 
 def read(folder: Path, split: str, options: ReadOptions) -> Dataset:

@@ -5,7 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from helpers.films import cut_film, pan
 from scgs_warp.capture.rig.instants import frame_seconds, time_line
+from scgs_warp.capture.source import Video
 from scgs_warp.data.synthetic.films.encoding import write_film
 from scgs_warp.errors import UserError
 
@@ -29,6 +31,14 @@ def test_frames_are_those_nearest_to_common_instants():
     np.testing.assert_allclose(np.diff(times), np.diff(line.moments) / np.ptp(line.moments))
     some = line.times([0, 1])[:2]  # a camera that is left out does not count
     assert some.min() == 0 and some.max() == 1 and times[:2].min() > 0
+
+
+def test_frames_before_a_cut_do_not_count(tmp_path):
+    """A film that was cut without being encoded anew begins with frames that are not shown."""
+    write_film(tmp_path / "whole.mp4", pan(range(60)), 30.0, 20, None)
+    cut_film(tmp_path / "whole.mp4", tmp_path / "cut.mp4", 10)
+    shown = list(Video(tmp_path / "cut.mp4").frames(64))
+    assert len(shown) == 50 and len(frame_seconds(tmp_path / "cut.mp4")) == len(shown)
 
 
 def test_locked_cameras_share_their_moments():

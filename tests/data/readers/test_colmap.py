@@ -65,10 +65,29 @@ def test_colmap(tmp_path, model, text):
         (["a1.png", "b.png", "c1.png"], [0.0, 0.5, 1.0]),
         (["7.png", "b7.png", "c7.png"], [0.0, 0.5, 1.0]),
         (["only 1.png"], [0.0]),
+        (["8.3.png", "8.75.png", "9.031.png", "10.3.png"], [0.0, 0.225, 0.3655, 1.0]),  # seconds
+        (["take 2.9.png", "take 2.10.png", "take 2.11.png"], [0.0, 0.5, 1.0]),
+        (["v1.2_0003.png", "v2.2_0004.png", "v3.2_0007.png"], [0.0, 0.25, 1.0]),
     ],
 )
 def test_times_in_names(names, expected):
-    assert colmap.times_from_names(names) == pytest.approx(expected)
+    assert colmap.times_from_names(names) == pytest.approx(expected, abs=1e-6)
+
+
+def test_a_scene_far_from_the_origin(tmp_path):
+    """As georeferenced models are: in float32 the cameras' places would be off by a tenth of their distance."""
+    far = np.array([4.2e6, -1.7e5, 4.78e6])
+    write_colmap(tmp_path, text=True, origin=far)
+    for split in ("train", "test"):
+        data = load(tmp_path, split)
+        views = torch.stack([camera.viewmat for camera in data.cameras]).double().numpy()
+        true = np.stack([viewmat(int(frame.name[6:]) - 1) for frame in data])
+        shift = np.einsum("vij,vj->vi", true[:, :3, :3].transpose(0, 2, 1), views[:, :3, 3] - true[:, :3, 3])
+        assert np.ptp(shift, axis=0).max() < 1e-5, "all cameras are moved by the same"
+        np.testing.assert_allclose(data.points.double().numpy() + shift[0], POINTS, atol=1e-5)
+        assert any("is subtracted from all cameras and points" in line for line in data.notes)
+        x, y, z = (float(word) for word in data.notes[-1].split("(")[1].split(")")[0].split(","))
+        np.testing.assert_allclose(far - (x, y, z), -shift[0], atol=1e-4)
 
 
 def test_any_names(tmp_path):

@@ -61,6 +61,10 @@ def test_splits_by_list_and_by_every_eighth(tmp_path):
     assert "test_filenames is missing" in message(tmp_path, "test")
     save(tmp_path, {**content, "train_filenames": ["f_3.png"]})
     assert "test_filenames is missing" in message(tmp_path, "test")
+    save(tmp_path, {**content, "train_filenames": ["f_0.png", "f_3.png"], "test_filenames": ["f_0.png"]})
+    assert [frame.name for frame in load(tmp_path, "train")] == ["f_3"], "what is held out is not trained on"
+    save(tmp_path, {**content, "train_filenames": ["f_0.png"], "val_filenames": ["f_0.png", "f_3.png"]})
+    assert "train_filenames are all among" in message(tmp_path)
     save(tmp_path, {**content, "train_filenames": ["f_99.png"]})
     assert "train_filenames names 'f_99.png'" in message(tmp_path)
 
@@ -94,6 +98,20 @@ def test_applied_transform_is_followed_whichever_way_it_was_meant(tmp_path, poin
     if points_too:
         write_ply(tmp_path / "points.ply", POINTS @ turn[:, :3].T + turn[:, 3], COLORS)
     assert share_of_colors_found(load(tmp_path)) > 0.8
+
+
+def test_a_scene_far_from_the_origin(tmp_path):
+    far = np.array([5e5, 5.4e6, 300.0])
+    content = write(tmp_path)
+    for entry in content["frames"]:
+        pose = np.array(entry["transform_matrix"])
+        pose[:3, 3] += far
+        entry["transform_matrix"] = pose.tolist()
+    save(tmp_path, content)
+    write_ply(tmp_path / "points.ply", POINTS, COLORS, far)
+    train, test = load(tmp_path), load(tmp_path, "test")
+    assert share_of_colors_found(train) > 0.8 and train.notes[-1] == test.notes[-1]
+    assert "is subtracted from all cameras and points" in train.notes[-1]
 
 
 def test_a_black_border_is_masked_but_nothing_dark_inside(tmp_path):

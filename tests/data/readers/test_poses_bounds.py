@@ -15,6 +15,7 @@ from helpers.layouts import (
     WIDTH,
     share_found,
     viewmat,
+    write_colmap,
     write_poses_bounds,
 )
 from scgs_warp.data import load
@@ -41,6 +42,20 @@ def test_poses_bounds_of_reduced_images(tmp_path):
         cv2.imwrite(str(file), cv2.resize(image, (WIDTH // 2, HEIGHT // 2), interpolation=cv2.INTER_AREA))
     camera = load(tmp_path)[0].camera
     assert [float(camera.K[0, 0]), float(camera.K[1, 2])] == [FOCAL / 2, HEIGHT / 4]
+
+
+@pytest.mark.parametrize("rig", [False, True])
+def test_a_model_beside_the_file(tmp_path, rig):
+    """LLFF and others keep the file beside the COLMAP model of one camera's images; a rig has a folder per camera."""
+    bounds, model = tmp_path / "bounds", tmp_path / "model"
+    write_poses_bounds(bounds)
+    write_colmap(model)
+    if rig:
+        (model / "sparse").rename(bounds / "sparse")
+    else:
+        (bounds / "poses_bounds.npy").rename(model / "poses_bounds.npy")
+        (model / "images_4").mkdir()
+    assert load(bounds if rig else model, "test")[0].name == ("cam00_0000" if rig else "frame_5")
 
 
 def test_videos_are_to_be_unpacked(tmp_path):
