@@ -10,11 +10,10 @@ from typing import TYPE_CHECKING
 from scgs_warp.apps.arguments import parse
 from scgs_warp.apps.cli import Device, prepare, run
 from scgs_warp.geometry.axes import Axis
+from scgs_warp.motion.static_nodes import MAX_COUNT
 
 if TYPE_CHECKING:
     from scgs_warp.edit import EditSession
-
-MAX_NODES = 20_000
 
 
 @dataclass(frozen=True)
@@ -83,10 +82,10 @@ def check(options: Options) -> None:
         raise UserError("edit.py: give one of --run and --ply")
     if options.up is not None and options.ply is None:
         raise UserError(f"--up {options.up}: belongs to --ply; a run knows from its cameras what is up")
-    if not 1 <= options.nodes <= MAX_NODES:
-        raise UserError(f"--nodes {options.nodes}: give 1 to {MAX_NODES}")
-    if options.parts is not None and not 1 <= options.parts <= MAX_NODES:
-        raise UserError(f"--parts {options.parts}: give 1 to {MAX_NODES}")
+    if not 1 <= options.nodes <= MAX_COUNT:
+        raise UserError(f"--nodes {options.nodes}: give 1 to {MAX_COUNT}")
+    if options.parts is not None and not 1 <= options.parts <= MAX_COUNT:
+        raise UserError(f"--parts {options.parts}: give 1 to {MAX_COUNT}")
     if options.skeleton and (options.output is not None or options.export is not None):
         raise UserError("--skeleton prints and ends; leave --output and --export out")
     if options.size is not None and not 16 <= options.size <= 8192:
@@ -178,7 +177,12 @@ def open_browser(session: EditSession, options: Options) -> None:
     assert source is not None
     folder = folder_for(source, options.folder)
     autosave = Autosave(session, folder, "" if options.ply is None else options.ply.name)
-    autosave.start(restore=options.script is None and not options.new)
+    session.skeleton  # noqa: B018 a skeleton.json that is wrong is refused here
+    asked = options.script is not None or options.motion is not None or options.parts is not None
+    autosave.start(restore=not asked and not options.new)
+    if options.size is not None:
+        session.resize_film(options.size)
+        autosave.note(session.edit)
     title = source.resolve().name
     served = {"port": options.port, "shared": options.share, "source": source}
     with stop_signals() as stop:  # Shells may make background processes ignore Ctrl-C.

@@ -13,6 +13,7 @@ from typing import Any, get_args
 import numpy as np
 
 from ..errors import UserError
+from ..motion.static_nodes import MAX_COUNT
 from . import skeleton_file
 from .document import Edit, Film, Shot, View
 from .engine import Engine
@@ -65,6 +66,12 @@ def to_json(edit: Edit, engine: Engine) -> str:
     }
     lines = [f" {json.dumps(key)}: {_compact(value)}" for key, value in content.items() if value is not None]
     return "{\n" + ",\n".join(lines) + "\n}\n"
+
+
+def control_points_of(path: Path) -> int:
+    """Return the number of control points of the scene for which an edit was saved; 0 if the file does not say."""
+    scene = FieldReader(read_object(path), str(path)).child("scene")
+    return 0 if scene is None else scene.integer("control_points", 0, 0, MAX_COUNT)
 
 
 def checked(edit: Edit, engine: Engine) -> Edit:

@@ -6,6 +6,7 @@ exception: each is computed from the previous one.
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 from collections import OrderedDict
 from collections.abc import Callable, Mapping
@@ -104,6 +105,13 @@ class Engine:
         self._live: _Live | None = None
         self._under: tuple[float, NodePose, Gaussians] | None = None
         """Gaussians under an edit's holds and exaggeration alone, which stay while parts are dragged."""
+
+    def drawn_with(self, scene: Scene) -> Engine:
+        """Return an engine that bends as this one and poses the Gaussians of another scene, whose places, neighbours
+        and motion are those of this one's. The two share caches."""
+        other = copy.copy(self)
+        other.scene, other._under = scene, None
+        return other
 
     def _shared(self) -> np.ndarray:
         """Return the two nearest control points of every opaque Gaussian, [N, 2]."""

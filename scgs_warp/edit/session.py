@@ -71,6 +71,14 @@ class EditSession(Posing):
         other._past, other._future, other._before_drag = deque(maxlen=HISTORY), [], None
         return other
 
+    def drawn_with(self, scene: Scene) -> EditSession:
+        """Return another session with this one's control points, parts and edit that poses the Gaussians of a scene
+        with the same motion: those in place of sharp ones, which some formats hold, have other opacities, by which
+        parts and neighbours would differ."""
+        other = self.fork()
+        other.engine, other.scene = self.engine.drawn_with(scene), scene
+        return other
+
     # The edit and its history
 
     def apply(self, edit: Edit) -> None:

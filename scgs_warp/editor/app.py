@@ -328,6 +328,10 @@ class Editor:
                 client.send(picture_message(jpeg, self._version), latest="picture")
             except UserError as error:
                 self.say(client, one_line(error))
+                client.send({"undrawn": True})
+            except Exception:
+                client.send({"undrawn": True})
+                raise
 
     def _pose_failed(self, number: int, error: Exception) -> None:
         if isinstance(error, UserError):

@@ -15,6 +15,7 @@ from ..runtime import addresses
 from ..storage.files import read_text, write_atomically
 from ..storage.locks import AlreadyLocked, lock_file
 from ..storage.own_folder import own_folder
+from .files import unused_path
 
 NAME = "autosave"
 AGAIN = 5.0
@@ -122,7 +123,8 @@ class Autosave:
         self.said = f"restored the edit that was kept in {self.path.name}; undo returns to the unedited scene"
 
     def _move_aside(self, suffix: str) -> Path:
-        aside = self.path.with_name(f"{self.path.stem}.{suffix}.json")
+        """Move the kept edit to a name that no other edit has."""
+        aside = unused_path(self.path.with_name(f"{self.path.stem}.{suffix}.json"))
         with suppress(OSError):
             os.replace(self.path, aside)
         return aside

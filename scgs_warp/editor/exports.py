@@ -86,14 +86,14 @@ def export_page(editor: Host, fields: FieldReader) -> str:
     """Start to write a web page that plays the edit, with parts to pull if the page asks for them."""
     from ..export.page import PageOptions, write_page
     from ..export.page_edit import edited_motion, film_times
-    from ..export.page_pose import with_parts
+    from ..export.page_pose import posable
     from ..export.poster import edited_poster
 
     path, posed, session = _path(editor, fields, ".html"), bool(fields.boolean("pose")), _forked(editor)
     title = short_text(fields, "title") if "title" in fields else editor.title
 
     def finish(motion: PageMotion) -> Path:
-        motion = with_parts(session, motion) if posed else motion
+        motion = posable(session, motion) if posed else motion
         picture = functools.partial(edited_poster, session)
         write_page(session.scene, path, PageOptions(title, motion=motion, picture=picture))
         return path

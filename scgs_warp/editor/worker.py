@@ -32,7 +32,8 @@ class Worker:
     Args:
         schedule: poses that are due; guarded by this worker's lock.
         pose: called with (client, wanted) without the lock, from this thread only.
-        failed: called with the client and the error if ``pose`` raises, inside the ``except`` block.
+        failed: called with the client and the error if ``pose`` raises, inside the ``except`` block; with 0 and the
+            error if what ``post`` was given raises.
     """
 
     def __init__(
@@ -122,7 +123,9 @@ class Worker:
         """
         with self._condition:
             if not self._stopped and not (once and any(call[1] == action for call in self._calls)):
-                self._calls.append((Future(), action))
+                future: Future[Any] = Future()
+                future.add_done_callback(self._report)  # nobody waits for it
+                self._calls.append((future, action))
                 self._condition.notify_all()
 
     def _run(self) -> None:
@@ -157,14 +160,25 @@ class Worker:
                 return lambda: _fulfil(future, action)
             return None
 
+    def _report(self, future: Future[Any]) -> None:
+        if future.cancelled():
+            return
+        try:
+            future.result()
+        except Exception as error:
+            self._tell(0, error)
+
     def _send(self, client: int, wanted: Wanted | None) -> None:
         try:
             self._pose(client, wanted)
         except Exception as error:  # a failed pose must not end the editor
-            try:
-                self._failed(client, error)
-            except Exception:
-                traceback.print_exc(file=sys.stderr)
+            self._tell(client, error)
+
+    def _tell(self, client: int, error: Exception) -> None:
+        try:
+            self._failed(client, error)
+        except Exception:
+            traceback.print_exc(file=sys.stderr)
 
 
 def _fulfil(future: Future[Any], action: Callable[[], Any]) -> None:

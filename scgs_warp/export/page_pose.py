@@ -13,17 +13,22 @@ from .page_parts import part_facts
 from .page_scene import STEPS, PageMotion
 
 
-def with_parts(session: EditSession, motion: PageMotion) -> PageMotion:
-    """Add the parts of the session's skeleton to a page's motion.
+def posable(session: EditSession, motion: PageMotion) -> PageMotion:
+    """Add the parts of the session's skeleton to a page's motion, for visitors to pull.
 
     Raises:
         UserError: the scene's motion has a mask.
     """
-    engine = session.engine
-    if bool(session.scene.config.motion.mask) and engine.rig.moves:
+    if bool(session.scene.config.motion.mask) and session.engine.rig.moves:
         raise UserError(
             "--pose: this scene's motion has a mask (motion.mask), which a page cannot pose; leave --pose out"
         )
+    return with_parts(session, motion)
+
+
+def with_parts(session: EditSession, motion: PageMotion) -> PageMotion:
+    """Add the parts of the session's skeleton to a page's motion."""
+    engine = session.engine
     poser = engine.poser(session.skeleton)
     skeleton, rows = poser.skeleton, poser.rows
     edges = poser.graph.edges

@@ -13,15 +13,16 @@ import torch
 
 from .. import data
 from ..config.fields import IMAGE_SETTINGS
-from ..edit import EditSession
+from ..edit import EditSession, edit_file
 from ..edit.skeleton import Skeleton as Parts
 from ..errors import UserError
 from ..formats.gaussian_files import read_antialiased, read_gaussians, shortage_as_user_error, write_gaussians
 from ..formats.sog_files import META
 from ..geometry.axes import Axis, direction
 from ..motion.control_points import ControlPoints
+from ..motion.static_nodes import COUNT
 from ..runtime.progress import progress
-from ..scene.from_gaussians import open_gaussians
+from ..scene.from_gaussians import open_gaussians, with_control_points
 from ..scene.scene import Scene
 from ..types import Gaussians
 from .cameras import write_cameras
@@ -91,6 +92,9 @@ def _open(request: ExportRequest, device: str) -> Scene:
 
 
 def _open_session(request: ExportRequest, scene: Scene) -> EditSession:
+    """Return a session on the scene with the edit. A scene at rest has as many control points as the edit's had."""
+    if request.edit is not None and not scene.motion.moves:
+        scene = with_control_points(scene, edit_file.control_points_of(request.edit) or COUNT)
     session = EditSession(scene)
     if request.edit is not None:
         session.load(request.edit)
@@ -107,10 +111,12 @@ def _export_still(request: ExportRequest, device: str) -> str:
             with shortage_as_user_error(request.ply):
                 gaussians, when = keep_finite(stored.activate()), f"as in {request.ply}"
     else:
-        scene = plain_scene(_open(request, device))
+        scene = _open(request, device)
         up, antialiased = scene.overview.up, scene.config.antialiased
-        if request.edit is not None:
-            session, at = _open_session(request, scene), request.at or 0.0
+        session = None if request.edit is None else _open_session(request, scene)
+        scene = plain_scene(scene if session is None else session.scene)
+        if session is not None:
+            session, at = session.drawn_with(scene), request.at or 0.0
             gaussians, when = session.gaussians_at(session.scene_time(at), at), f"{at:g} s into the edit's film"
         elif request.time is not None:
             gaussians, when = scene.gaussians_at(request.time), f"at time {request.time:g}"
@@ -151,12 +157,13 @@ def write_still(
 
 
 def _export_moving(request: ExportRequest, device: str) -> str:
-    scene = opened = _open(request, device)
-    if request.kind not in ("graph", "tracks"):
-        scene = plain_scene(scene)
-    session = None
+    scene, session = _open(request, device), None
     if request.edit is not None or (request.kind not in FRAME_FORMATS and scene.motion.moves):
         session = _open_session(request, scene)
+    parts = session.skeleton if session is not None and request.skeleton == "parts" else None
+    if request.kind not in ("graph", "tracks"):
+        scene = plain_scene(scene if session is None else session.scene)
+        session = None if session is None else session.drawn_with(scene)
     if session is None and request.kind == "glb":
         gaussians = keep_finite(at_rest(scene))
         write_glb(request.output, gaussians, scene.overview.up)
@@ -172,8 +179,7 @@ def _export_moving(request: ExportRequest, device: str) -> str:
     if request.kind == "4dgs":
         return export_fourdgs(request.output, scene, session, moments, _usable(scene))
     assert session is not None
-    if request.skeleton == "parts":
-        parts = session.edit.skeleton or EditSession(opened).skeleton  # that of the run, not of its plain Gaussians
+    if parts is not None:
         return _write_rig(request.output, session, parts, moments)
     return _write_skeleton(request, session, moments)
 
@@ -313,7 +319,7 @@ def _export_page(request: ExportRequest, device: str) -> str:
 def _with_session(request: ExportRequest, scene: Scene, options: PageOptions) -> tuple[Scene, PageOptions]:
     """Return the scene with control points, and the page's options with the edit's film and the parts."""
     from .page_edit import edited_motion, film_times, own_motion
-    from .page_pose import with_parts
+    from .page_pose import posable
 
     session = _open_session(request, scene)
     if request.edit is None:
@@ -322,5 +328,5 @@ def _with_session(request: ExportRequest, scene: Scene, options: PageOptions) ->
         with progress(len(film_times(session)), "export") as shown:
             motion = edited_motion(session, shown.advance)
         picture = functools.partial(edited_poster, session)
-    motion = with_parts(session, motion) if request.pose else motion
+    motion = posable(session, motion) if request.pose else motion
     return session.scene, replace(options, motion=motion, picture=picture)

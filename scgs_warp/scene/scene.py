@@ -173,7 +173,8 @@ class Scene:
 
         Returns:
             N Gaussians in world units on the scene's device. Row i is the same Gaussian at every time. Those with a
-            sharpness above 0 are approximated by plain Gaussians (``Gaussians.plain``).
+            sharpness above 0 are approximated by plain Gaussians (``Gaussians.plain``). Some tensors share memory with
+            the scene: copy them before you change them.
 
         Raises:
             UserError: the time is non-finite.
@@ -181,12 +182,12 @@ class Scene:
         posed = self.motion.gaussians_at(self.gaussians, clamped_time(time))
         undo = self.normalisation
         return Gaussians(
-            undo.undo(posed.means),
-            posed.quats,
-            undo.undo_scale(posed.scales),
-            posed.opacities,
-            posed.sh_dc,
-            posed.sh_rest,
+            undo.undo(posed.means).detach(),
+            posed.quats.detach(),
+            undo.undo_scale(posed.scales).detach(),
+            posed.opacities.detach(),
+            posed.sh_dc.detach(),
+            posed.sh_rest.detach(),
             posed.sharpness,
         ).plain()
 

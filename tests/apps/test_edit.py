@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import copy
 import json
 import sys
 from pathlib import Path
@@ -12,6 +14,7 @@ import torch
 from helpers.edit_scenes import bar_scene, dress
 from helpers.edit_scripts import SCRIPT
 from scgs_warp.apps import edit as app
+from scgs_warp.edit import Edit, EditSession
 from scgs_warp.formats.gaussian_files import read_gaussians
 from scgs_warp.formats.gaussian_ply import read_gaussian_ply, write_gaussian_ply
 from scgs_warp.scene.from_gaussians import open_gaussians
@@ -94,6 +97,54 @@ def test_a_wrong_script_stops_the_app(ply, tmp_path, capsys):
     assert app.cli(arguments) == 2
     assert "film.fps" in capsys.readouterr().err and not (tmp_path / "film.mp4").exists()
     assert open_gaussians(ply).gaussian_count == 300
+
+
+@pytest.fixture
+def opened(monkeypatch) -> list[EditSession]:
+    """Sessions that the app opens in the browser; each is edited, and ends at once."""
+    seen: list[EditSession] = []
+
+    class Shown:
+        url = "shown"
+
+        def __init__(self, session, folder, *, autosave, **_) -> None:
+            self.autosave = autosave
+            seen.append(copy.copy(session))
+            session.add_handle([0, 1], 0.0, f"hand {len(seen)}")
+
+        def stop(self) -> None:
+            self.autosave.stop()
+
+    class Ended:
+        def wait(self) -> None:
+            pass
+
+    monkeypatch.setattr("scgs_warp.editor.Editor", Shown)
+    monkeypatch.setattr("scgs_warp.runtime.stop_signals.stop_signals", lambda: contextlib.nullcontext(Ended()))
+    return seen
+
+
+def test_what_is_asked_for_begins_in_place_of_the_kept_edit(ply, opened, tmp_path):
+    command = ["--ply", str(ply), "--nodes", "40"]
+    (tmp_path / "edit.json").write_text(json.dumps({k: SCRIPT[k] for k in ("format", "version", "film")}))
+    for further in ([], ["--size", "320"], ["--parts", "2"], ["--script", str(tmp_path / "edit.json")], ["--new"]):
+        assert app.cli([*command, *further]) == 0
+    first, sized, parted, scripted, new = (session.edit for session in opened)
+    assert not first.handles and [handle.name for handle in sized.handles] == ["hand 1"] and sized.film.size == 320
+    assert not parted.handles and parted.skeleton is not None and len(parted.skeleton.parts) == 2
+    assert not scripted.handles and new == Edit()
+    aside = sorted(file.name for file in (ply.parent / "edits").glob("*previous*"))
+    assert len(aside) == 3, aside
+
+
+def test_a_wrong_skeleton_is_refused_before_the_page_opens(opened, monkeypatch, tmp_path, capsys):
+    scene = bar_scene()
+    scene.folder = tmp_path
+    (tmp_path / "skeleton.json").write_text('{"format": "scgs-warp skeleton", "version": 99}')
+    monkeypatch.setattr(app, "open_session", lambda options, device: EditSession(scene))
+    assert app.cli(["--run", str(tmp_path)]) == 2
+    error = capsys.readouterr().err.strip()
+    assert "skeleton.json: version is 99" in error and len(error.splitlines()) == 1 and not opened
 
 
 def test_without_aiohttp_the_editor_says_what_to_install(tmp_path, monkeypatch, capsys):

@@ -97,6 +97,25 @@ def test_a_damaged_edit_is_put_aside_and_said(session, content, tmp_path):
     assert (tmp_path / "autosave.damaged.json").read_bytes() == content
 
 
+def test_no_kept_edit_is_overwritten(tmp_path):
+    """An edit of another number of control points is put aside beside the one that was put aside before."""
+    for life, nodes in enumerate((12, 15, 12, 15)):
+        session = EditSession(bar_scene(nodes=nodes, gaussians=20))
+        keeper = Autosave(session, tmp_path)
+        keeper.start(restore=True)
+        assert ("cannot be used" in keeper.said) == (life > 0)
+        session.add_handle([0, 1], 0.0, f"hand {life}")
+        keeper.stop()
+    for _ in range(2):
+        keeper = Autosave(EditSession(bar_scene(nodes=15, gaussians=20)), tmp_path)
+        keeper.start(restore=False)
+        keeper._session.add_handle([0], 0.0, "new")
+        keeper.stop()
+    found = {file.name: "".join(file.read_text().split()) for file in tmp_path.glob("autosave*.json")}
+    assert all(any(f'"hand{life}"' in text for text in found.values()) for life in range(4)), found.keys()
+    assert len(found) == 6
+
+
 def test_what_cannot_be_saved_is_said_and_tried_again(session, tmp_path, monkeypatch):
     keeper = Autosave(session, tmp_path)
     keeper.start(restore=True)

@@ -204,12 +204,30 @@ def test_the_page_looks_through_the_camera_of_the_film(browser, editor):
     window.close()
 
 
+def test_undo_brings_the_background_back(browser, editor):
+    window = Window(browser, editor)
+    window.still()
+    before = window.ask("[...player.background]")
+    window.page.keyboard.press("b")
+    until(lambda: window.ask("studio.link.state.film.background") is not None)
+    assert window.ask("[...player.background]") != before
+    window.page.keyboard.press("Control+z")
+    until(lambda: window.ask("studio.link.state.film.background") is None)
+    until(lambda: window.ask("[...player.background]") == before)
+    window.close()
+
+
 def test_a_page_without_webgl_shows_pictures(browser, editor):
     window = Window(browser, editor, "&pictures")
     until(lambda: window.ask("player.canvas.width > 100 && !player.waits && !player.stale"))
     shot = np.asarray(Image.open(io.BytesIO(window.page.locator("#view").screenshot())).convert("RGB"))
     assert (shot > 40).any(2).mean() > 0.02
     assert "The server draws instead" in window.page.locator("#notes").inner_text()
+    window.ask("player.waits = true")
+    window.ask("studio.link.hear({ undrawn: true })")
+    assert not window.ask("player.waits"), "a picture that fails is not waited for"
+    window.ask("(() => { player.waits = true; studio.link.gone(false); studio.found(); })()")
+    until(lambda: window.ask("!player.waits && !player.stale"))
     window.page.get_by_label("Part", exact=True).select_option(index=2)
     until(lambda: window.ask("studio.link.state.part"))
     window.close()

@@ -103,6 +103,19 @@ def test_a_pose_that_fails_takes_nobody_along(bench, capfd):
     assert "a pose that fails" in capfd.readouterr().err, "the error of whoever is told is printed"
 
 
+def test_what_is_posted_and_fails_is_told(bench):
+    bench.worker.post(lambda: (_ for _ in ()).throw(UserError("posted")))
+    bench.settle()
+    assert bench.failed == [(0, "posted")]
+    bench.block()
+    bench.worker.post(lambda: 1)
+    stopping = threading.Thread(target=bench.worker.stop)
+    stopping.start()
+    bench.gate.set()
+    stopping.join(10)
+    assert bench.failed == [(0, "posted")], "what is cancelled has not failed"
+
+
 def test_calls_return_raise_and_are_cancelled(bench):
     name = bench.worker.call(lambda: threading.current_thread().name)
     assert name == "editor" and bench.worker.call(lambda: bench.worker.call(lambda: 3)) == 3

@@ -17,7 +17,7 @@ from scgs_warp.edit.filming import film_camera
 from scgs_warp.errors import UserError
 from scgs_warp.export.page import write_page
 from scgs_warp.export.page_edit import edited_motion, film_times, own_motion
-from scgs_warp.export.page_pose import with_parts
+from scgs_warp.export.page_pose import posable
 
 
 @pytest.fixture(scope="module")
@@ -101,4 +101,4 @@ def test_masks_are_refused():
     with pytest.raises(UserError, match=r"motion\.mask"):
         edited_motion(session)
     with pytest.raises(UserError, match=r"motion\.mask"):
-        with_parts(session, own_motion(session))
+        posable(session, own_motion(session))

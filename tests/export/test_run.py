@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import copy
+import dataclasses
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -25,6 +28,7 @@ from scgs_warp.export.run import write_still
 from scgs_warp.export.skeleton import at_rest, build_skeleton, even_moments
 from scgs_warp.motion import Static, build_motion
 from scgs_warp.motion.control_points import ControlPoints
+from scgs_warp.scene.from_gaussians import open_gaussians
 from scgs_warp.scene.scene import Scene
 from scgs_warp.storage import checkpoint
 from scgs_warp.types import Gaussians
@@ -251,6 +255,56 @@ def test_an_edit_is_exported(run, tmp_path):
         means, _, _, sh_dc = documented_player()["play"](played, second)
         np.testing.assert_allclose(means, truth.means, atol=2e-6)
         np.testing.assert_allclose(sh_dc, truth.sh_dc, atol=2e-5)
+
+
+def test_an_edit_poses_the_parts_of_the_run_in_every_format(run, tmp_path, monkeypatch):
+    """Gaussians in place of sharp ones have other opacities, by which parts and neighbours would be others."""
+    folder = tmp_path / "run"
+    shutil.copytree(run, folder)
+
+    def plain(scene: Scene) -> Scene:
+        made = copy.deepcopy(scene.gaussians)
+        with torch.no_grad():
+            made.opacity_logits[::2] = -6.0
+        return Scene(made, scene.motion, scene.normalisation, scene.config, scene.overview)
+
+    monkeypatch.setattr("scgs_warp.export.run.plain_scene", plain)
+    scene = Scene.load(folder)
+    session = EditSession(scene)
+    own = session.parts()[-1].name
+    session.rename_part(own, "left")
+    session.save_skeleton()
+    session.turn("left", 50, axis=(0, 1, 0))
+    session.save(tmp_path / "edit.json")
+    written = json.loads((tmp_path / "edit.json").read_text())
+    del written["skeleton"]
+    (tmp_path / "edit.json").write_text(json.dumps(written))
+    truth = session.gaussians_at(session.scene_time(0.5), 0.5).means.numpy()
+    assert np.abs(truth - scene.gaussians_at(session.scene_time(0.5)).means.numpy()).max() > 0.1
+    export("--run", folder, "--edit", tmp_path / "edit.json", "--at", 0.5, "--output", tmp_path / "a.ply")
+    data = PlyData.read(str(tmp_path / "a.ply"))["vertex"].data
+    np.testing.assert_array_equal(np.stack([data[axis] for axis in "xyz"], axis=1), truth)
+    assert (np.sort(data["opacity"])[: len(truth) // 2] < -5).all(), "the Gaussians are those in place of sharp ones"
+    session.edit = dataclasses.replace(session.edit, skin="nodes")
+    export("--run", folder, "--edit", tmp_path / "edit.json", "--output", tmp_path / "a.npz")
+    played = dict(np.load(tmp_path / "a.npz"))
+    second = float(played["seconds"][len(played["seconds"]) // 2])
+    means = documented_player()["play"](played, second)[0]
+    expected = session.gaussians_at(session.scene_time(second), second).means
+    np.testing.assert_allclose(means, expected, atol=1e-4)
+
+
+def test_an_edit_of_a_scene_at_rest_keeps_its_control_points(run, tmp_path):
+    """``export.py`` has no --nodes: the edit says how many there were."""
+    source = tmp_path / "a.ply"
+    write_still(source, Scene.load(run).gaussians_at(0.0))
+    session = EditSession(open_gaussians(source, "cpu", 9))
+    session.add_handle([0, 1], 0.0, "end")
+    session.move("end", [0, 0, 0.3])
+    session.save(tmp_path / "edit.json")
+    export("--ply", source, "--edit", tmp_path / "edit.json", "--output", tmp_path / "b.ply")
+    data = PlyData.read(str(tmp_path / "b.ply"))["vertex"].data
+    np.testing.assert_allclose(data["z"], session.gaussians_at(0.0, 0.0).means[:, 2], atol=1e-6)
 
 
 @pytest.mark.parametrize("name", ["a.spz", "a.compressed.ply", "a.sog", "loose/meta.json", "loose"])

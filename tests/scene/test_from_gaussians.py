@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import replace
 from pathlib import Path
 from typing import get_args
@@ -11,12 +12,13 @@ import pytest
 import torch
 
 from helpers.app_runs import run_app
+from helpers.edit_scenes import bar_scene
 from helpers.export_files import cloud
 from scgs_warp.export.request import ExportRequest
 from scgs_warp.export.run import export, write_still
 from scgs_warp.geometry.axes import Axis, direction
 from scgs_warp.geometry.cameras import orbit_camera
-from scgs_warp.scene.from_gaussians import open_gaussians
+from scgs_warp.scene.from_gaussians import open_gaussians, with_control_points
 
 
 def column(folder: Path, axis: Axis) -> Path:
@@ -72,3 +74,12 @@ def test_a_run_knows_what_is_up(tmp_path, app):
     output = tmp_path / ("a.ply" if app == "export" else "a.gif")
     done = run_app(app, "--run", str(tmp_path), "--up", "z", "--output", str(output))
     assert done.returncode == 2 and "--up z: belongs to --ply" in done.stderr
+
+
+@pytest.mark.parametrize("moves", [False, True])
+def test_posed_gaussians_need_no_gradients(moves):
+    scene = bar_scene()
+    gaussians = (scene if moves else with_control_points(scene)).gaussians_at(0.3)
+    for field in dataclasses.fields(gaussians):
+        value = getattr(gaussians, field.name)
+        assert not (isinstance(value, torch.Tensor) and value.requires_grad), field.name

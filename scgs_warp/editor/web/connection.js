@@ -51,6 +51,7 @@ class Link {
     if (!this.missing.size) this.arrived();
     if (message.said) this.listener.said(message.said);
     if (message.file) this.listener.file(message);
+    if (message.undrawn) this.listener.picture(null);
     if (message.done) {
       const asker = this.waiting.get(message.id);
       this.waiting.delete(message.id);

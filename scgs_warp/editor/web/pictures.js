@@ -57,6 +57,11 @@ class PicturePlayer {
     this.link.tell("picture", { at: this.at, ...this.camera() });
   }
 
+  // What was asked for does not come.
+  giveUp() {
+    this.waits = false;
+  }
+
   async take(jpeg) {
     const picture = await createImageBitmap(new Blob([jpeg], { type: "image/jpeg" }));
     this.canvas.width = picture.width;

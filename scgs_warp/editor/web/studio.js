@@ -49,7 +49,7 @@ class Studio {
     this.link = new Link({
       hello: (hello) => this.greet(hello), camera: (camera) => this.film(camera), state: (state) => this.show(state), said: (said) => this.note(said.text, said.kind),
       file: ({ file, job }) => this.offer(file, job), parts: (parts) => this.know(parts), silent: (on) => this.silent(on), pose: () => this.player?.changed(),
-      gone: (answers) => this.lost(answers), moved: () => this.anew(), picture: (jpeg) => this.player?.take(jpeg),
+      gone: (answers) => this.lost(answers), moved: () => this.anew(), picture: (jpeg) => (jpeg ? this.player?.take(jpeg) : this.player?.giveUp?.()),
     });
   }
 
@@ -82,6 +82,7 @@ class Studio {
 
   lost(answers) {
     if (this.tools?.drag) this.tools.stop();
+    this.player?.giveUp?.();
     const kept = this.link.state?.saved === false ? "Its last change may be lost." : "The edit is saved.";
     element("gone").textContent = answers ? `${STRANGE} The view is kept.`
       : `The server has gone. ${kept} Nothing can be edited until the server is started again; this page waits for it.`;
@@ -170,8 +171,8 @@ class Studio {
 
   show(state) {
     if (!this.panel) return;
-    const { player } = this, color = state.film.background;
-    if (color && JSON.stringify(color) !== this.painted) {
+    const { player } = this, color = state.film.background ?? this.hello.background;
+    if (JSON.stringify(color) !== this.painted) {
       this.painted = JSON.stringify(color);
       player.background = color;
     }
