@@ -111,8 +111,8 @@ def check(options: Options) -> None:
         memory = f"; a frame of {options.size} x {options.size} would take {video.frame_gib(options.size):,.1f} GiB"
         needed = memory if options.size > LARGEST_SIDE else ""
         raise UserError(f"--size {options.size}: give 16 to {LARGEST_SIDE} pixels{needed}")
-    if not 0 < options.fps <= 1000:
-        raise UserError(f"--fps {options.fps:g}: give more than 0 and at most 1000 frames a second")
+    if not video.SLOWEST <= options.fps <= 1000:
+        raise UserError(f"--fps {options.fps:g}: give {video.SLOWEST} to 1000 frames a second")
     if not 0 <= options.time <= 1:
         raise UserError(f"--time {options.time:g}: give a time from 0 to 1")
     video.check_path(options.output)

@@ -24,6 +24,8 @@ class GaussianParameters(nn.Module):
     ``correctives`` [N, 27] or [N, 0]; ``sharpness``, the same for all (:class:`Gaussians`).
     """
 
+    left_out = 0
+    """Number of Gaussians of the file that were not finite."""
     NAMES = ("means", "quats", "log_scales", "opacity_logits", "sh_dc", "sh_rest", "hyper", "shading", "correctives")
 
     def __init__(

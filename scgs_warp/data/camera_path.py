@@ -97,6 +97,9 @@ def read_camera_path(path: Path, overview: Overview) -> CameraPath:
         raise UserError(f"{path}: holds no list camera_path or frames; give a camera path, or a transforms.json")
     if len(entries) > MOST_CAMERAS:
         raise UserError(f"{path}: {key} has {len(entries):,} cameras; give at most {MOST_CAMERAS:,}")
+    kind = content.get("camera_type", "perspective") if key == "camera_path" else "perspective"
+    if not isinstance(kind, str) or kind.lower() != "perspective":
+        raise UserError(f"{path}: camera_type is {str(kind)[:40]}; films are perspective: export a perspective path")
     aspect = _aspect(path, content, overview)
     read = _nerfstudio if key == "camera_path" else _frame
     return CameraPath(
@@ -115,11 +118,12 @@ def _aspect(path: Path, content: dict[str, Any], overview: Overview) -> float:
 
 
 def _time(where: str, entry: dict[str, Any]) -> float | None:
-    if entry.get("time") is None:
+    name = "time" if entry.get("time") is not None else "render_time"  # nerfstudio's
+    if entry.get(name) is None:
         return None
-    time = as_number(entry["time"])
+    time = as_number(entry[name])
     if time is None or not 0.0 <= time <= 1.0:
-        raise UserError(f"{where}.time is {str(entry['time'])[:40]}; give a number from 0 to 1, or leave it out")
+        raise UserError(f"{where}.{name} is {str(entry[name])[:40]}; give a number from 0 to 1, or leave it out")
     return time
 
 

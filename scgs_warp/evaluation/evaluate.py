@@ -26,6 +26,9 @@ from .image_metrics import psnr, ssim
 from .motion_metrics import load_ground_truth, score_motion
 from .thin_structures import RodCheck, load_rods
 
+MOST_DECIBELS = 100.0
+"""PSNR of an image that equals the truth, such as one that shows the background alone. Infinity would be the mean of
+all images."""
 SHEET_ROWS = 8
 """Number of images on a contact sheet, evenly spread over the split."""
 
@@ -33,8 +36,15 @@ Lpips = Callable[[Tensor, Tensor], Tensor | float]
 
 
 def _mean(values: list[float]) -> float | None:
-    """Return the mean, summed exactly so that the order of the images does not matter; None for an empty list."""
-    return math.fsum(values) / len(values) if values else None
+    """Return the mean, summed exactly so that the order of the images does not matter; None for an empty list. Images
+    without a valid pixel, whose score is not a number, do not count."""
+    known = [value for value in values if not math.isnan(value)]
+    return math.fsum(known) / len(known) if known else None
+
+
+def _decibels(image: Tensor, truth: Tensor) -> float:
+    """Return the PSNR, at most ``MOST_DECIBELS``."""
+    return min(float(psnr(image, truth)), MOST_DECIBELS) if image.numel() else math.nan
 
 
 def _recolored(image: Tensor, color: Tensor) -> Tensor:
@@ -50,7 +60,7 @@ def _color_scores(frame: Frame, image: Tensor, truth: Tensor, colors: FrameColor
         shown["interpolated"] = _recolored(image, colors.at(frame.time))
     scores = {}
     for name, picture in shown.items():
-        scores[f"psnr_{name}"] = float(psnr(picture, truth) if mask is None else psnr(picture[mask], truth[mask]))
+        scores[f"psnr_{name}"] = _decibels(picture, truth) if mask is None else _decibels(picture[mask], truth[mask])
         scores[f"ssim_{name}"] = float(ssim(picture, truth, mask))
     return scores
 
@@ -60,7 +70,7 @@ def _measure(frame: Frame, image: Tensor, alpha: Tensor, truth: Tensor, lpips: L
     device."""
     mask = None if frame.mask is None else frame.mask.to(image.device)
     row: dict[str, Any] = {"name": frame.name, "time": float(frame.time)}
-    row["psnr"] = float(psnr(image, truth) if mask is None else psnr(image[mask], truth[mask]))
+    row["psnr"] = _decibels(image, truth) if mask is None else _decibels(image[mask], truth[mask])
     row["ssim"] = float(ssim(image, truth, mask))
     if lpips is not None:
         if mask is not None:  # outside the mask the truth is unknown: show no difference
@@ -82,16 +92,14 @@ class _Renders:
         self._titles: list[str] = []
         self._scores: list[float] = []
         self._alphas: list[tuple[Tensor, Tensor] | None] = []
-        self._names: set[str] = set()
         try:
             for name in ("renders", "truth"):
                 (folder / name).mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise UserError(f"{folder}: cannot be written ({error.strerror}); make the folder writable") from None
 
-    def add(self, index: int, frame: Frame, image: Tensor, alpha: Tensor, truth: Tensor, score: float) -> None:
-        name = frame.name if frame.name and frame.name not in self._names else f"{index:05d}"
-        self._names.add(name)
+    def add(self, row: dict[str, Any], index: int, frame: Frame, image: Tensor, alpha: Tensor, truth: Tensor) -> None:
+        name, score = row["name"], row["psnr"]
         pair = to_bytes(truth), to_bytes(image)
         self._write(self.folder / "truth" / f"{name}.png", pair[0])
         self._write(self.folder / "renders" / f"{name}.png", pair[1])
@@ -116,6 +124,19 @@ class _Renders:
             write_png(path, image)
         except OSError as error:
             raise UserError(f"{path}: cannot be written ({error.strerror}); free space there") from None
+
+
+def _distinct(names: list[str]) -> list[str]:
+    """Return names for files, one per frame: that of the frame, with the frame's number if an earlier one has it."""
+    found: dict[str, None] = {}
+    for index, name in enumerate(names):
+        chosen = name or f"{index:05d}"
+        if chosen in found:
+            chosen = f"{name}_{index:05d}"
+        while chosen in found:
+            chosen += "_"
+        found[chosen] = None
+    return list(found)
 
 
 @torch.no_grad()
@@ -156,16 +177,17 @@ def evaluate(
     """
     background = dataset.background_color
     renders = None if render_dir is None else _Renders(Path(render_dir), len(dataset), tuple(background.tolist()))
-    rows = []
+    rows: list[dict[str, Any]] = []
+    names = _distinct([entry.name for entry in dataset.entries])
     for index, frame in enumerate(dataset):
         rendered = scene.render(frame.camera, frame.time, background)
         image = rendered.rgb.clamp(0.0, 1.0)
         truth = frame.image.to(image.device).clamp(0.0, 1.0)
-        rows.append(_measure(frame, image, rendered.alpha, truth, lpips))
+        rows.append({**_measure(frame, image, rendered.alpha, truth, lpips), "name": names[index]})
         if colors is not None or fit_color:
             rows[-1].update(_color_scores(frame, image, truth, colors))
         if renders is not None:
-            renders.add(index, frame, image, rendered.alpha, truth, rows[-1]["psnr"])
+            renders.add(rows[-1], index, frame, image, rendered.alpha, truth)
         if watch is not None:
             watch(index, frame, rendered.alpha)
         if progress is not None:
@@ -173,12 +195,13 @@ def evaluate(
     if renders is not None:
         renders.finish()
     means = {name: _mean([row[name] for row in rows if name in row]) for name in ("psnr", "ssim", "lpips")}
-    names = [f"{score}_{way}" for way in ("fitted", "interpolated") for score in ("psnr", "ssim")]
-    colored = {name: _mean([row[name] for row in rows]) for name in names if rows and name in rows[0]}
+    ways = [f"{score}_{way}" for way in ("fitted", "interpolated") for score in ("psnr", "ssim")]
+    colored = {name: _mean([row[name] for row in rows]) for name in ways if rows and name in rows[0]}
     return {**means, **_spread_of_psnr(rows), **colored, **summarise(rows), "images": len(rows), "per_image": rows}
 
 
 def _spread_of_psnr(rows: list[dict[str, Any]]) -> dict[str, float | None]:
+    rows = [row for row in rows if not math.isnan(row["psnr"])]
     worst = min(rows, key=lambda row: row["psnr"], default={})
     median = statistics.median(row["psnr"] for row in rows) if rows else None
     return {"psnr_median": median, "psnr_worst": worst.get("psnr"), "psnr_worst_time": worst.get("time")}

@@ -17,7 +17,8 @@ listed are limited to 1e6."""
 
 
 def to_parameters(path: Path, values: dict[str, np.ndarray]) -> GaussianParameters:
-    """Convert rows of a file to parameters, leaving out rows that are non-finite, too large or without a rotation.
+    """Convert rows of a file to parameters, leaving out rows that are non-finite, too large or without a rotation;
+    ``left_out`` of the result is their number.
 
     Args:
         values: float32 arrays [N, ...], by the names of :class:`GaussianParameters`; harmonics are [N, K - 1, 3].
@@ -33,6 +34,7 @@ def to_parameters(path: Path, values: dict[str, np.ndarray]) -> GaussianParamete
     if not good.any():
         raise UserError(f"{path}: none of its {total} Gaussians is finite; export it again")
     made = GaussianParameters.empty(int(good.sum()), rest, 0, False, False, "cpu")
+    made.left_out = total - len(made)
     with torch.no_grad():
         for name, value in values.items():
             rows = value if good.all() else value[good]  # Avoid copying large files needlessly.

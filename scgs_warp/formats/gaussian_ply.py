@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -24,6 +25,8 @@ REST_COLUMNS = (0, 9, 24, 45)
 """Numbers of ``f_rest_*`` columns for degrees 0 to 3."""
 OPAQUE_LOGIT = 80.0
 """Largest logit of an opacity: opaque up to rounding. It replaces infinity, which some programs write."""
+FLAT = math.log(1e-30)
+"""Least logarithm of a scale. It replaces that of 0, which some programs write for flat Gaussians."""
 
 
 def read_gaussian_ply(path: str | Path) -> GaussianParameters:
@@ -65,7 +68,8 @@ def read_gaussian_ply(path: str | Path) -> GaussianParameters:
         sh_rest = columns(*(f"f_rest_{i}" for i in range(rest))).reshape(-1, 3, rest // 3).transpose(0, 2, 1)
     values = {
         "means": means, "sh_dc": dc, "sh_rest": sh_rest, "opacity_logits": opacity,
-        "log_scales": columns("scale_0", "scale_1", "scale_2"), "quats": columns("rot_0", "rot_1", "rot_2", "rot_3"),
+        "log_scales": np.maximum(columns("scale_0", "scale_1", "scale_2"), FLAT),
+        "quats": columns("rot_0", "rot_1", "rot_2", "rot_3"),
     }  # fmt: skip
     return to_parameters(path, values)
 

@@ -98,8 +98,11 @@ def sphere_reset_due(config: TrainConfig, done: int) -> bool:
 def gradient_threshold(config: DensifyConfig, width: int, height: int, sharpness: float = 0.0) -> float:
     """Return the gradient threshold for this image size, normalised device coordinates. It grows as sharp splats become
     narrower, since the gradients of their means grow likewise; otherwise there would be more of them."""
-    threshold = config.grad_threshold * (800.0 / math.sqrt(width * height)) ** config.resolution_exponent
-    return threshold / plain_scale(sharpness)
+    return _scaled(config.grad_threshold, config, width, height, sharpness)
+
+
+def _scaled(threshold: float, config: DensifyConfig, width: int, height: int, sharpness: float) -> float:
+    return threshold * (800.0 / math.sqrt(width * height)) ** config.resolution_exponent / plain_scale(sharpness)
 
 
 def affordable_count(gaussians: GaussianParameters, wanted: int) -> int:
@@ -216,7 +219,7 @@ def _control_gaussians(state: TrainState, size: tuple[int, int], visible: Tensor
                 state.motion_optimizer,
                 state.gaussians,
                 mean_gradient(state.stats),
-                grad_threshold=threshold * config.node_grad_threshold / config.grad_threshold,
+                grad_threshold=_scaled(config.node_grad_threshold, config, *size, state.gaussians.sharpness),
                 least_impact=config.node_impact,
                 growth=config.node_growth,
             )

@@ -96,6 +96,8 @@ def fit(
         # The first process may have to restore a checkpoint before the others read it.
         state = group.in_turn(open_state) if group is not None and resume else open_state()
         state.group = group
+        if resume and state.step == config.steps and (group is None or group.first):
+            _end_here(state, folder)
         frames = Frames(data, state.normalisation, config, device, state.compared_stereo(data))
         folder.start(state.step)
 
@@ -109,6 +111,13 @@ def fit(
                 raise _process_lost(state, folder, lost) from lost
         state.motion.eval()
         return state.scene()
+
+
+def _end_here(state: TrainState, folder: RunFolder) -> None:
+    """Save a run whose last step is now the one that it has reached, unless its checkpoint says so already."""
+    _, metadata = checkpoint.read(folder.path, ())
+    if metadata["config"]["steps"] != state.config.steps:
+        state.save(folder.path)
 
 
 def _start_or_resume(folder: RunFolder, config: TrainConfig, data: Dataset, device: str) -> TrainState:
@@ -356,8 +365,11 @@ def _count_failure(
         # No dropped step has touched the parameters. A step in flight is part of the saved state.
         for late in steps.settle():
             state.step = late.step + 1
+        failures, state.failures = state.failures, 0  # a run that goes on may drop as many again
         state.save(folder.path)
+        state.failures = failures
         raise UserError(
             f"{folder.path}: {term} was not finite {MOST_FAILURES} times in a row, up to step {state.step}; the "
-            "checkpoint holds the last good state; lower the learning rates or check the data, then --resume"
+            "checkpoint holds the last good state; check the data, then --resume, or train again with lower learning "
+            "rates and another --output"
         )

@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 from ..config.presets import FREE_TO_CHANGE, TrainConfig
+from ..data.dataset import Dataset
 from ..errors import UserError
+from ..geometry.cameras import Overview, overview
+
+SAME_CAMERAS = 0.02
+"""Largest relative difference between two summaries of the same cameras, which versions may compute differently."""
 
 
 def check_steps(step: int, config: TrainConfig, source: str) -> None:
@@ -18,6 +24,26 @@ def check_steps(step: int, config: TrainConfig, source: str) -> None:
         raise UserError(
             f"{source}: is at step {step:,} already, beyond --steps {config.steps}; give at least {step}, or leave "
             "--steps out"
+        )
+
+
+def check_same_frames(saved: dict[str, Any], data: Dataset, source: str) -> None:
+    """Refuse to continue on other frames, or on frames with other cameras.
+
+    Args:
+        saved: metadata of the checkpoint.
+
+    Raises:
+        UserError: names the data set and the remedy.
+    """
+    if saved.get("frames") != data.fingerprint:
+        raise UserError(f"{source}: made from other frames than those of {data.folder}; give the same --data")
+    then, now = Overview.from_dict(saved["overview"]), overview(data.cameras)
+    shift, turn = math.dist(then.centre, now.centre) / then.radius, math.dist(then.up, now.up)
+    if max(shift, turn, abs(now.radius / then.radius - 1.0), abs(now.fov_x / then.fov_x - 1.0)) > SAME_CAMERAS:
+        raise UserError(
+            f"{source}: made with other cameras than those of {data.folder}; restore them, or train again with "
+            "another --output"
         )
 
 

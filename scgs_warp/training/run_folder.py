@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import os
+import re
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -22,7 +23,8 @@ from ..evaluation.run_time import log_entries
 from ..runtime.progress import Progress, say
 from ..scene.scene import Scene
 from ..storage.checkpoint import FILE, PREVIOUS
-from ..storage.files import write_atomically
+from ..storage.files import read_text, write_atomically
+from ..storage.json_files import parse_json
 from ..storage.locks import AlreadyLocked, lock_file
 from .pace import Pace
 from .state import StepResult, TrainState
@@ -33,6 +35,11 @@ LOG_EVERY = 50
 PREVIEW_SECONDS = 15.0
 LOCK = ".lock"
 PREVIEWS = "previews"
+SETTINGS, LOG = "config.json", "log.jsonl"
+RESULTS = ("metrics.json", "contact_sheet.png", "curves.png", "turntable.mp4", "evaluation")
+"""What training writes after its last step."""
+PARTIAL = re.compile(r"\.(config\.json|log\.jsonl|latest\.png|contact_sheet\.png|checkpoint[^/]*)(\..*)?\.tmp")
+"""Names of files that a killed trainer leaves behind half written."""
 BEFORE_SETTINGS = {PREVIEWS, LOCK}
 """What a run directory holds before ``config.json``."""
 TEST_IMAGES = 4
@@ -42,13 +49,29 @@ BOARD_IMAGES = 20
 
 
 def refuse_existing(path: Path, resume: bool) -> None:
-    """Refuse to overwrite a run.
+    """Refuse to overwrite a run, its results, or files of the same names that are no run's. What a run that was killed
+    before its first checkpoint left may be overwritten.
 
     Raises:
-        UserError: ``path`` holds a run, and ``resume`` is False.
+        UserError: ``path`` holds such files, and ``resume`` is False.
     """
-    if not resume and ((path / FILE).exists() or (path / PREVIOUS).exists()):
+    if resume:
+        return
+    if (path / FILE).exists() or (path / PREVIOUS).exists():
         raise UserError(f"{path}: holds a run already; continue it with --resume or choose another --output")
+    begun = RESULTS if _has_settings(path / SETTINGS) else (SETTINGS, LOG, *RESULTS)
+    for name in begun:
+        if (path / name).exists():
+            raise UserError(f"{path}: holds {name}, which training would overwrite; choose another --output")
+
+
+def _has_settings(path: Path) -> bool:
+    """Return whether a file holds the settings of a run."""
+    try:
+        values = parse_json(read_text(path))
+    except (OSError, ValueError, UserError):
+        return False
+    return isinstance(values, dict) and {"preset", "steps", "pretrain", "motion"} <= values.keys()
 
 
 class RunFolder:
@@ -146,7 +169,7 @@ class RunFolder:
         """
         if any((self.path / name).exists() for name in (FILE, PREVIOUS)):
             return False
-        if (self.path / "config.json").is_file():
+        if (self.path / SETTINGS).is_file():
             return True
         return all(entry.name in BEFORE_SETTINGS or entry.match(".*.tmp") for entry in self.path.iterdir())
 
@@ -154,8 +177,9 @@ class RunFolder:
         """Write the configuration; drop the log lines after ``step``, which a resumed run writes again; remove partial
         files left by a killed process."""
         for left in self.path.glob(".*.tmp"):
-            with suppress(OSError):
-                left.unlink()
+            if PARTIAL.fullmatch(left.name):
+                with suppress(OSError):
+                    left.unlink()
         self._write_settings()
         entries: list[dict[str, Any]] = []
         for entry in log_entries(self.path) if self.resume else []:
@@ -163,7 +187,7 @@ class RunFolder:
                 if int(entry.get("step", 0)) <= step:
                     self.seconds = max(self.seconds, float(entry.get("seconds", 0.0)))
                     entries.append(entry)
-        write_atomically(self.path / "log.jsonl", "".join(json.dumps(entry) + "\n" for entry in entries).encode())
+        write_atomically(self.path / LOG, "".join(json.dumps(entry) + "\n" for entry in entries).encode())
         if self.tensorboard:
             with self._optional("the event files for TensorBoard"):
                 self._board = TensorBoard(self.path, entries, step, self.seconds)
@@ -171,7 +195,7 @@ class RunFolder:
 
     def _write_settings(self) -> None:
         text = json.dumps(self.settings, indent=2, sort_keys=True)
-        write_atomically(self.path / "config.json", text.encode())
+        write_atomically(self.path / SETTINGS, text.encode())
 
     @property
     def elapsed(self) -> float:
@@ -183,7 +207,7 @@ class RunFolder:
         line = json.dumps({**entry, "seconds": round(self.elapsed, 2)}) + "\n"
         with self._optional("log lines"):
             torn, self._torn = self._torn, True
-            with open(self.path / "log.jsonl", "a", encoding="utf-8") as file:
+            with open(self.path / LOG, "a", encoding="utf-8") as file:
                 file.write("\n" + line if torn else line)
             self._torn = False
         self._on_board(lambda board: board.record(entry))

@@ -45,7 +45,7 @@ from .pretrain import (
     thin_spheres,
 )
 from .process_group import ProcessGroup
-from .resuming import check_same_configuration, check_steps
+from .resuming import check_same_configuration, check_same_frames, check_steps
 from .second_config import may_be_tried_again
 from .silhouettes import half_thickness, is_in_parts, is_thin
 from .start_motion import SeenMotion, learn_motion
@@ -255,8 +255,7 @@ class TrainState:
         saved, wanted = with_newer_fields(metadata["config"], recorded=True), to_dict(config)
         check_same_configuration({"data": saved.get("data")}, {"data": wanted["data"]}, source)
         # Settings that the data chooses differ with the frames, so the frames come before them.
-        if metadata.get("frames") != data.fingerprint:
-            raise UserError(f"{source}: made from other frames than those of {data.folder}; give the same --data")
+        check_same_frames(metadata, data, source)
         check_same_configuration(saved, wanted, source)
         check_tensors(tensors, source)
         check_resumed(tensors, metadata, source)

@@ -29,8 +29,10 @@ def turntable(
 ) -> Path:
     """Write a film of a scene; see :meth:`Scene.turntable`."""
     target = video.check_path(path)
-    if frames < 1 or not 16 <= size <= 8192 or not 0 < fps <= 1000:
-        raise UserError(f"frames {frames}, size {size}, fps {fps:g}: give at least 1, 16 to 8192, and 1 to 1000")
+    if frames < 1 or not 16 <= size <= 8192 or not video.SLOWEST <= fps <= 1000:
+        raise UserError(
+            f"frames {frames}, size {size}, fps {fps:g}: give at least 1, 16 to 8192, and {video.SLOWEST} to 1000"
+        )
     path_cameras = cameras.turntable(framed(scene), frames, size)
     last = max(frames - 1, 1)
     views = [

@@ -25,6 +25,8 @@ PIXEL_BYTES = 64
 """Bytes per pixel of a frame in progress: colour, coverage and depth in float32, their bytes, the encoder's buffers."""
 GIF_PIXEL_BYTES = 4
 """Bytes per pixel of each frame that a GIF keeps: colour and palette index."""
+SLOWEST = 0.01
+"""Least number of frames a second: a GIF's frame lasts at most 655 seconds."""
 FRAME_NAME = "frame_{:05d}.png"
 FRAME_PATTERN = r"frame_\d{5,}\.png"
 
@@ -256,8 +258,8 @@ def film(path: str | Path, fps: float = 30, *, quality: int = QUALITY) -> Iterat
         Exception: exceptions of the body of the ``with`` pass unchanged.
     """
     path = check_path(path)
-    if not 0 < fps <= 1000:
-        raise UserError(f"fps is {fps}; give a number of frames a second between 0 and 1000")
+    if not SLOWEST <= fps <= 1000:
+        raise UserError(f"fps is {fps}; give {SLOWEST} to 1000 frames a second")
     writers = {".mp4": _Mp4, ".gif": _Gif, "": _Folder}
     writer = writers[path.suffix.lower()](path, fps, quality)
     try:

@@ -36,6 +36,17 @@ def test_a_path_of_nerfstudio(tmp_path):
         assert float(camera.K[1, 1]) == pytest.approx(40 / math.tan(math.radians(25)), rel=1e-5)
 
 
+def test_times_of_nerfstudio_are_followed(tmp_path):
+    path = nerfstudio(tmp_path, camera_type="PERSPECTIVE")
+    content = json.loads(path.read_text())
+    for entry, time in zip(content["camera_path"], (0.2, 0.2, 0.7)):
+        entry["render_time"] = time
+    path.write_text(json.dumps(content))
+    assert [time for _, time in read_camera_path(path, OVERVIEW).film(None, 120)] == [0.2, 0.2, 0.7]
+    with pytest.raises(UserError, match="camera_type is equirectangular; films are perspective"):
+        read_camera_path(nerfstudio(tmp_path, camera_type="equirectangular"), OVERVIEW)
+
+
 def test_frames_of_a_data_set(tmp_path):
     write(tmp_path, 4)
     film = read_camera_path(tmp_path / "transforms.json", OVERVIEW).film(None, WIDTH)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import math
 from pathlib import Path
@@ -17,7 +18,7 @@ from scgs_warp import data
 from scgs_warp.apps import evaluate as app
 from scgs_warp.data import Dataset
 from scgs_warp.errors import UserError
-from scgs_warp.evaluation.evaluate import evaluate, metrics_of, write_metrics
+from scgs_warp.evaluation.evaluate import MOST_DECIBELS, evaluate, metrics_of, write_metrics
 from scgs_warp.visualization import figures
 
 CONTRACT = {"psnr", "ssim", "lpips", "split", "images", "step", "seconds", "gaussians", "control_points", "motion",
@@ -39,7 +40,7 @@ def test_means_over_images() -> None:
         expected.append(float(ssim_map(image, frame.image.permute(2, 0, 1).double()).mean()))
     np.testing.assert_allclose([row["ssim"] for row in found["per_image"]], expected, atol=1e-5)
     assert found["ssim"] == pytest.approx(math.fsum(expected) / 5, abs=1e-5)
-    assert [row["name"] for row in found["per_image"]] == ["r_000", "r_001", "r_002", "r_000", "r_001"]
+    assert [row["name"] for row in found["per_image"]] == ["r_000", "r_001", "r_002", "r_000_00003", "r_001_00004"]
     assert [row["time"] for row in found["per_image"]] == [0, 0.5, 1, 0, 1]
 
 
@@ -126,6 +127,30 @@ def test_renders_lie_beside_the_truth(tmp_path: Path) -> None:
     truth = cv2.imread(str(tmp_path / "made" / "truth" / "r_001.png"))[..., ::-1]
     np.testing.assert_array_equal(truth, figures.to_bytes(first[1].image))
     assert cv2.imread(str(tmp_path / "made" / "contact_sheet.png")).shape[1] == 4 * 30 + 4  # cropped
+
+
+def test_each_frame_has_a_file_of_its_own(tmp_path: Path) -> None:
+    """Also where the number that tells two frames apart is another frame's name."""
+    scene = FakeScene()
+    frames = [*fake_dataset(scene, 3, error=0.1)] * 3
+    names = ["00001", "00001", "00001_00001", "", "00003", "", "", "00001", "00001_00007"]
+    named = [dataclasses.replace(frame, name=name) for frame, name in zip(frames, names)]
+    found = evaluate(scene, Dataset(named, folder=Path("x"), split="test"), render_dir=tmp_path / "made")
+    listed = [row["name"] for row in found["per_image"]]
+    assert listed[0] == "00001" and len(set(listed)) == 9
+    for kind in ("renders", "truth"):
+        assert sorted(path.stem for path in (tmp_path / "made" / kind).iterdir()) == sorted(listed)
+
+
+def test_an_image_that_equals_the_truth_counts_as_a_hundred_decibels() -> None:
+    """A view beside the subject shows the background alone; infinity would be the mean of all images."""
+    scene = FakeScene()
+    frames = [*fake_dataset(scene, 2, error=0.1), fake_dataset(scene, 1, error=0.0)[0]]
+    nothing = dataclasses.replace(frames[0], mask=torch.zeros(40, 40, dtype=torch.bool))
+    found = evaluate(scene, Dataset([*frames, nothing], folder=Path("x"), split="test"))
+    assert found["psnr"] == pytest.approx((20 + 20 + MOST_DECIBELS) / 3, abs=1e-3)
+    assert found["psnr_median"] == found["psnr_worst"] == pytest.approx(20, abs=1e-3)
+    assert math.isnan(found["per_image"][3]["psnr"]) and found["images"] == 4
 
 
 def test_nowhere_to_write_is_told(tmp_path: Path) -> None:

@@ -13,6 +13,7 @@ from plyfile import PlyData, PlyElement
 from helpers.edit_scenes import dress
 from helpers.export_files import cloud, difference, ordered, picture, ply_columns
 from helpers.node_packages import splat_transform
+from scgs_warp.apps import export as app
 from scgs_warp.edit import EditSession
 from scgs_warp.edit.rotations import from_axis
 from scgs_warp.errors import UserError
@@ -64,6 +65,20 @@ def test_infinite_logits_are_opaque_or_clear(tmp_path):
     assert len(found) == 5 and found.opacities().tolist()[1::2] == [1.0, pytest.approx(0.0, abs=1e-30)]
     expected[1], expected[3] = OPAQUE_LOGIT, -OPAQUE_LOGIT
     assert torch.equal(found.opacity_logits, expected)
+
+
+def test_flat_gaussians_are_kept_and_those_left_out_are_counted(tmp_path, capsys):
+    """Programs that store a thickness of 0 write the logarithm -inf."""
+    path = tmp_path / "flat.ply"
+    data = PlyData.read(str(make(tmp_path, 0, 6)), mmap=False)
+    data["vertex"].data["scale_2"][:3] = -np.inf
+    data["vertex"].data["scale_0"][5] = np.nan
+    data.write(str(path))
+    found = read_gaussian_ply(path)
+    assert len(found) == 5 and found.left_out == 1
+    assert (found.activate().scales[:3, 2] < 1e-29).all() and found.activate().scales.isfinite().all()
+    assert app.cli(["--ply", str(path), "--output", str(tmp_path / "flat.splat"), "--device", "cpu"]) == 0
+    assert "5 Gaussians as in" in (out := capsys.readouterr().out) and "without 1 that are not finite" in out
 
 
 def test_a_file_is_edited_and_exported(tmp_path):

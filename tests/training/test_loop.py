@@ -17,6 +17,7 @@ from scgs_warp.errors import UserError
 from scgs_warp.evaluation.evaluate import evaluate
 from scgs_warp.evaluation.image_metrics import psnr
 from scgs_warp.scene.scene import Scene
+from scgs_warp.storage import checkpoint
 from scgs_warp.training import loop
 from scgs_warp.training.densify import RESET_OPACITY
 from scgs_warp.training.frames import Frames
@@ -160,6 +161,29 @@ def test_repeated_failure_stops_at_the_last_good_state(tmp_path):
         frame.image[:] = float("inf")
     with pytest.raises(UserError, match="not finite 20 times"):
         fit(tiny_config(60), data, output=tmp_path / "run")
+    some = tiny_dataset(3)
+    some[0].image[:] = float("inf")  # one dropped step does not end the run again
+    fit(tiny_config(60), some, output=tmp_path / "run", resume=True)
+    _, metadata = checkpoint.read(tmp_path / "run", ())
+    assert metadata["step"] == 60 and metadata["failures"] <= 1
+
+
+def test_a_run_that_ends_where_it_is_is_finished(tmp_path):
+    data = tiny_dataset(3)
+    fit(tiny_config(60), data, output=tmp_path / "run")
+    longer = dataclasses.replace(tiny_config(60), steps=80)
+    state = TrainState.resume(tmp_path / "run", longer, data, "cpu")
+    state.save(tmp_path / "run")  # as an interrupted run of 80 steps leaves it
+    assert Scene.load(tmp_path / "run").unfinished == "step 60 of 80, unfinished"
+    fit(tiny_config(60), data, output=tmp_path / "run", resume=True)
+    assert Scene.load(tmp_path / "run").unfinished is None
+
+
+@pytest.mark.parametrize("field", ["optim.network", "densify.grad_threshold"])
+def test_rates_and_thresholds_may_be_zero(field, tmp_path):
+    section, name = field.split(".")
+    scene = fit(tiny_config(60, **{section: {name: 0.0}}), tiny_dataset(3), output=tmp_path / "run")
+    assert scene.step == 60
 
 
 def test_refusals(tmp_path):

@@ -12,10 +12,12 @@ import pytest
 import torch
 
 from helpers.tiny import tiny_config, tiny_dataset
+from scgs_warp.config.presets import to_dict
 from scgs_warp.errors import UserError
 from scgs_warp.evaluation.image_metrics import psnr
 from scgs_warp.evaluation.run_time import read_seconds
 from scgs_warp.training.frames import Frames
+from scgs_warp.training.loop import fit
 from scgs_warp.training.run_folder import ReadOnlyRunFolder, RunFolder, refuse_existing
 from scgs_warp.training.state import TrainState
 from scgs_warp.training.step import training_step
@@ -94,6 +96,30 @@ def test_a_run_is_not_overwritten(tmp_path):
     refuse_existing(tmp_path, resume=True)
     with pytest.raises(UserError, match="holds a run already"):
         refuse_existing(tmp_path, resume=False)
+
+
+@pytest.mark.parametrize("name", ["config.json", "log.jsonl", "metrics.json", "turntable.mp4", "evaluation"])
+def test_files_of_others_are_not_overwritten(name, tmp_path):
+    """Nor the scores of a run whose checkpoint was deleted."""
+    (tmp_path / name).write_text('{"mine": 1}')
+    (tmp_path / ".notes.tmp").write_text("mine")
+    for _ in range(2):
+        with pytest.raises(UserError, match=f"holds {name}, which training would overwrite"):
+            fit(tiny_config(20), tiny_dataset(3), output=tmp_path)
+        if name != "config.json":
+            (tmp_path / "config.json").write_text(json.dumps(to_dict(tiny_config(20))))
+        if name == "log.jsonl":
+            break  # the log of a run that was killed before its first checkpoint
+    assert (tmp_path / name).read_text() == '{"mine": 1}' and (tmp_path / ".notes.tmp").read_text() == "mine"
+
+
+def test_what_a_killed_run_left_is_overwritten(tmp_path):
+    config = tiny_config(20)
+    (tmp_path / "config.json").write_text(json.dumps(to_dict(config)))
+    for name in ("log.jsonl", ".notes.tmp", ".log.jsonl.0123abcd.tmp", ".checkpoint.safetensors.tmp"):
+        (tmp_path / name).write_text("")
+    fit(config, tiny_dataset(3), output=tmp_path)
+    assert sorted(path.name for path in tmp_path.glob(".*.tmp")) == [".notes.tmp"]
 
 
 def test_the_curve_is_the_mean_of_images_from_the_whole_split(tmp_path):

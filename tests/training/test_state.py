@@ -16,6 +16,7 @@ from scgs_warp.storage import checkpoint
 from scgs_warp.training.initial_points import HALF_SIZE
 from scgs_warp.training.loop import fit
 from scgs_warp.training.state import TrainState, has_initial_points, resolve_auto
+from scgs_warp.types import Camera
 
 
 def checkpoint_bytes(folder: Path) -> bytes:
@@ -36,6 +37,28 @@ def test_resume_refuses_other_frames(tmp_path):
     fit(config, tiny_dataset(3), output=tmp_path / "run")
     with pytest.raises(UserError, match="other frames"):
         fit(config, tiny_dataset(4), output=tmp_path / "run", resume=True)
+
+
+@pytest.mark.parametrize("change", ["farther", "turned", "wider"])
+def test_resume_refuses_other_cameras(change, tmp_path):
+    """Names, times and sizes stay if cameras are found anew in the same folder."""
+    config, data = tiny_config(20), tiny_dataset(6)
+    fit(config, data, output=tmp_path / "run")
+    turn = torch.tensor([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
+    frames = []
+    for frame in data:
+        viewmat, K = frame.camera.viewmat.clone(), frame.camera.K.clone()
+        if change == "farther":
+            viewmat[:3, 3] *= 1.1
+        elif change == "turned":
+            viewmat = viewmat @ turn
+        else:
+            K[:2, :2] *= 0.9
+        frames.append(dataclasses.replace(frame, camera=Camera(viewmat, K, 48, 48)))
+    other = type(data)(frames, folder=data.folder, split="train")
+    with pytest.raises(UserError, match="other cameras than those of tiny; restore them"):
+        fit(config, other, output=tmp_path / "run", resume=True)
+    fit(config, data, output=tmp_path / "run", resume=True)
 
 
 def test_resume_names_settings_of_the_data_before_the_frames(tmp_path):

@@ -5,6 +5,7 @@ Formulas: glTF 2.0 specification, appendix C (interpolation).
 
 from __future__ import annotations
 
+import re
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -14,6 +15,9 @@ from .file import GltfFile
 
 PATHS = {"translation": 3, "rotation": 4, "scale": 3}
 """Number of components of each animated property; ``weights`` has one per morph target of the mesh."""
+POINTER = "KHR_animation_pointer"
+POINTED = re.compile(r"/nodes/([0-9]{1,9})/(translation|rotation|scale|weights)")
+"""Pointers of that extension to what channels without it move as well."""
 
 
 class Sampler(NamedTuple):
@@ -40,6 +44,8 @@ class Clip(NamedTuple):
     """Time of the first keyframe, seconds."""
     end: float
     """Time of the last keyframe, seconds."""
+    ignored: int = 0
+    """Number of channels that move something else than nodes and weights."""
 
 
 def slerp(a: np.ndarray, b: np.ndarray, share: float) -> np.ndarray:
@@ -93,30 +99,33 @@ def read_clips(file: GltfFile) -> list[Clip]:
     """
     clips = []
     for index, animation in enumerate(file.document.animations or []):
-        channels = []
+        channels, ignored = [], 0
         for number, channel in enumerate(animation.channels or []):
             parsed = _channel(file, animation, channel, f"animations[{index}].channels[{number}]")
-            if parsed is not None:
+            if parsed is None:
+                ignored += 1
+            else:
                 channels.append(parsed)
         times = [channel.sampler.times for channel in channels]
         start = min((float(t[0]) for t in times), default=0.0)
         end = max((float(t[-1]) for t in times), default=0.0)
-        clips.append(Clip(animation.name or f"animation_{index}", channels, start, end))
+        clips.append(Clip(animation.name or f"animation_{index}", channels, start, end, ignored))
     return clips
 
 
 def _channel(file: GltfFile, animation: Any, channel: Any, where: str) -> Channel | None:
     target = channel.target
-    if target is None or target.node is None:
-        return None  # The specification says to ignore channels without a node.
-    path = target.path
-    if path not in PATHS and path != "weights":
-        return None  # The path belongs to an extension.
-    file.item("nodes", target.node, f"{where}.target.node")
+    node, path = (None, None) if target is None else (target.node, target.path)
+    pointer = ((target.extensions or {}).get(POINTER) or {}).get("pointer") if target is not None else None
+    if isinstance(pointer, str) and (found := POINTED.fullmatch(pointer)) is not None:
+        node, path = int(found[1]), found[2]
+    if node is None or path not in (*PATHS, "weights"):
+        return None  # The specification says to ignore channels without a node; other paths belong to extensions.
+    file.item("nodes", node, f"{where}.target")
     samplers = animation.samplers or []
     if not isinstance(channel.sampler, int) or not 0 <= channel.sampler < len(samplers):
         raise file.error(f"{where}.sampler", f"is {channel.sampler!r} of {len(samplers)}; export the file again")
-    return Channel(target.node, path, _sampler(file, samplers[channel.sampler], path, where))
+    return Channel(node, path, _sampler(file, samplers[channel.sampler], path, where))
 
 
 def _sampler(file: GltfFile, sampler: Any, path: str, where: str) -> Sampler:

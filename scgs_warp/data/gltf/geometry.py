@@ -10,11 +10,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from .file import GltfFile
+from .file import REMEDIES, GltfFile
 from .materials import Material, transformed
 from .nodes import Nodes
 
 TRIANGLES, STRIP, FAN = 4, 5, 6
+DRACO = "KHR_draco_mesh_compression"
 
 
 class Bone(NamedTuple):
@@ -59,6 +60,7 @@ class MeshPart(NamedTuple):
     """[P, K], rows sum to 1."""
     targets: tuple[np.ndarray, np.ndarray] | None
     """Position and normal differences of the morph targets, each [targets, P, 3]."""
+    node: int = 0
 
 
 class Geometry(NamedTuple):
@@ -103,7 +105,8 @@ def read_geometry(file: GltfFile, nodes: Nodes, materials: list[Material]) -> Ge
                     palette.extend(_skin(file, skin, f"nodes[{index}].skin"))
                 first = skins[skin]
                 joints = len(file.document.skins[skin].joints)
-            part = _part(file, primitive, mode, materials, first, joints, where)
+            _refuse_compressed(file, primitive, where)
+            part = _part(file, primitive, mode, materials, first, joints, where)._replace(node=index)
             if part.targets is not None:
                 rest = file.node_weights(index) or mesh.weights or []
                 weights = np.zeros(len(part.targets[0]))
@@ -115,6 +118,15 @@ def read_geometry(file: GltfFile, nodes: Nodes, materials: list[Material]) -> Ge
         only = f" (only {skipped} sets of points or lines)" if skipped else ""
         raise file.error("meshes", f"draw no triangles{only}; export a file with a surface")
     return Geometry(parts, palette, morphs, skipped)
+
+
+def _refuse_compressed(file: GltfFile, primitive: Any, where: str) -> None:
+    """Refuse a primitive that has compressed data only, though the file does not require the extension."""
+    accessor = _attribute(primitive.attributes, "POSITION")
+    if DRACO in (primitive.extensions or {}) and accessor is not None:
+        stored = file.item("accessors", accessor, f"{where}.attributes.POSITION")
+        if stored.bufferView is None and stored.sparse is None:
+            raise file.error(f"{where}.extensions", f"has {DRACO}, which is not supported; {REMEDIES[DRACO]}")
 
 
 def _attribute(attributes: Any, name: str) -> Any:

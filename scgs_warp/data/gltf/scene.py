@@ -15,6 +15,8 @@ from .geometry import Bone, MeshPart, Morph, read_geometry
 from .materials import Material, Texture, read_materials
 from .nodes import Nodes
 
+MOMENTS = 16
+"""Number of moments at which a node is looked for that has an extent."""
 UPRIGHT = np.array([[1.0, 0, 0, 0], [0, 0, -1, 0], [0, 1, 0, 0], [0, 0, 0, 1]])
 """Rotation from glTF (y up, a figure faces +z) to this package's worlds (z up, the figure faces -y)."""
 
@@ -168,11 +170,18 @@ def _triangles(parts: list[MeshPart]) -> Triangles:
 
 
 def _face_outward(scene: GltfScene) -> None:
-    """Reverse the triangles of mirrored nodes, because the specification inverts their winding order."""
-    matrices = scene.palette_at(scene.clip.start if scene.clip else 0.0)
-    start = 0
+    """Reverse the triangles of mirrored nodes, because the specification inverts their winding order (glTF 2.0, 3.7.4),
+    also that of skinned meshes. A node counts as it is when it first has an extent."""
+    start, clip = 0, scene.clip
+    seconds = np.linspace(clip.start, clip.end, MOMENTS) if clip else np.zeros(1)
+    mirrors = np.zeros(len(scene.nodes.nodes))
+    for second in seconds:
+        found = np.linalg.det(scene.nodes.world(clip, float(second))[:, :3, :3])
+        mirrors = np.where(mirrors == 0.0, found, mirrors)
+        if mirrors.all():
+            break
     for part in scene.parts:
         rows = slice(start, start + len(part.faces))
-        if part.bones.shape[1] == 1 and len(part.bones) and np.linalg.det(matrices[part.bones[0, 0]]) < 0:
+        if mirrors[part.node] < 0:
             scene.triangles.faces[rows] = scene.triangles.faces[rows, ::-1]
         start = rows.stop

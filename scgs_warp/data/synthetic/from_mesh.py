@@ -190,6 +190,10 @@ def describe(scene: GltfScene, span: tuple[float, float]) -> list[str]:
         others = [clip.name for clip in scene.clips if clip is not scene.clip]
         more = f"; there are also {', '.join(others)}" if others else ""
         lines.append(f"clip {scene.clip.name}, {span[0]:.2f} to {span[1]:.2f} s{more}")
+        if scene.clip.ignored:
+            lines.append(f"{scene.clip.ignored} of its channels move neither nodes nor weights, and are left out")
+        if span[0] == span[1]:
+            lines.append("the clip has no length: nothing will move; choose another with --clip")
     if scene.skipped:
         lines.append(f"{scene.skipped} sets of points or lines are left out")
     return lines

@@ -19,6 +19,7 @@ from scgs_warp.data.gltf.animation import Sampler, interpolate, slerp
 from scgs_warp.data.gltf.file import GltfFile
 from scgs_warp.data.gltf.nodes import rotation_matrix
 from scgs_warp.data.gltf.scene import UPRIGHT, GltfScene, read_scene
+from scgs_warp.data.synthetic.from_mesh import describe
 from scgs_warp.errors import UserError
 
 
@@ -146,6 +147,53 @@ def test_mirrored_nodes_still_face_outward(tmp_path):
         corners = scene.posed(0.0).positions[scene.triangles.faces]
         volume = np.einsum("fi,fi->f", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])).sum() / 6
         assert volume == pytest.approx(8 * abs(np.prod(scale)), rel=1e-6)
+
+
+@pytest.mark.parametrize("popping", [False, True])
+def test_mirrored_skins_still_face_outward(tmp_path, popping):
+    """A part that has no extent at first counts as it is later."""
+    for scale in ([1, 1, 1], [-1, 1, 1]):
+        glb = Glb()
+        weights = glb.array(np.tile([1.0, 0, 0, 0], (8, 1)))
+        joints = glb.array(np.zeros((8, 4)), "B")
+        glb.add("meshes", primitives=[glb.primitive(BOX, BOX_FACES, JOINTS_0=joints, WEIGHTS_0=weights)])
+        glb.add("skins", joints=[2])
+        glb.document["nodes"] = [{"children": [1, 2], "scale": scale}, {"mesh": 0, "skin": 0}, {}]
+        if popping:
+            keys = np.array([[0, 0, 0], scale])
+            glb.animate(glb.clip("Pop"), 0, "scale", [0.0, 1.0], keys)
+        scene = read(glb, tmp_path)
+        corners = scene.posed(1.0).positions[scene.triangles.faces]
+        volume = np.einsum("fi,fi->f", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])).sum() / 6
+        assert volume == pytest.approx(8, rel=1e-6)
+
+
+def test_compressed_parts_are_refused_though_not_required(tmp_path):
+    glb = Glb()
+    primitive = glb.primitive(BOX, BOX_FACES, extensions={"KHR_draco_mesh_compression": {"bufferView": 0}})
+    glb.add("meshes", primitives=[glb.primitive(BOX, BOX_FACES), primitive])
+    glb.document["nodes"] = [{"mesh": 0}]
+    assert len(read(glb, tmp_path).triangles.faces) == 24, "what is stored without compression is read"
+    del glb.document["accessors"][primitive["attributes"]["POSITION"]]["bufferView"]
+    with pytest.raises(UserError, match=r"meshes\[0\]\.primitives\[1\]\.extensions has KHR_draco.*without Draco"):
+        read(glb, tmp_path)
+
+
+def test_pointers_to_nodes_are_followed_and_others_counted(tmp_path):
+    glb = Glb()
+    glb.add("meshes", primitives=[glb.primitive(BOX, BOX_FACES)])
+    glb.document["nodes"] = [{"mesh": 0}]
+    clip = glb.clip("Slide")
+    glb.animate(clip, 0, "translation", [0.0, 2.0], np.array([[0.0, 0, 0], [4, 0, 0]]))
+    glb.animate(clip, 0, "translation", [0.0, 2.0], np.array([[0.0, 0, 0], [4, 0, 0]]))
+    for channel, pointer in zip(glb.document["animations"][0]["channels"], ("/nodes/0/translation", "/materials/0/x")):
+        channel["target"] = {"path": "pointer", "extensions": {"KHR_animation_pointer": {"pointer": pointer}}}
+    scene = read(glb, tmp_path)
+    assert np.abs(scene.posed(1.0).positions - upright(BOX + np.array([2.0, 0, 0]))).max() < 1e-6
+    assert scene.clip is not None and scene.clip.ignored == 1 and (scene.clip.start, scene.clip.end) == (0, 2)
+    lines = describe(scene, (0.0, 2.0))
+    assert any(line.startswith("1 of its channels") for line in lines) and "nothing will move" not in " ".join(lines)
+    assert any("has no length: nothing will move" in line for line in describe(scene, (1.0, 1.0)))
 
 
 def test_matrix_nodes_instances_and_several_primitives(tmp_path):
