@@ -110,7 +110,7 @@ class Video:
             stream = container.streams.video[0]
             stream.thread_type = "AUTO"
             shape = float(stream.sample_aspect_ratio or 1)
-            first, index, size = None, 0, None
+            first, index, size, last = None, 0, None, 0.0
             for packet in container.demux(stream):
                 try:
                     decoded = packet.decode()
@@ -119,13 +119,15 @@ class Video:
                 for frame in decoded:
                     seconds = float(frame.time) if frame.time is not None else index / self.rate
                     first = seconds if first is None else first
-                    size = size or (frame.width, frame.height)
-                    if size != (frame.width, frame.height):
-                        raise UserError(
-                            f"{self.path}: its pictures are {size_text(size)} up to second {seconds - first:.2f}, then "
-                            f"{size_text((frame.width, frame.height))}; give an earlier --end, or save it in one size"
-                        )
                     if wanted is None or index in wanted:
+                        size = size or (frame.width, frame.height)
+                        now = frame.width, frame.height
+                        if size != now:
+                            raise UserError(
+                                f"{self.path}: its pictures are {size_text(size)}, but {size_text(now)} from second "
+                                f"{seconds - first:.2f} on; give an --end before {last:.2f}, or save it in one size"
+                            )
+                        last = seconds - first
                         yield SourceFrame(index, seconds - first, _picture(frame, longest, shape), "")
                     index += 1
         if index == 0:

@@ -97,7 +97,7 @@ def read_camera_path(path: Path, overview: Overview) -> CameraPath:
         raise UserError(f"{path}: holds no list camera_path or frames; give a camera path, or a transforms.json")
     if len(entries) > MOST_CAMERAS:
         raise UserError(f"{path}: {key} has {len(entries):,} cameras; give at most {MOST_CAMERAS:,}")
-    kind = content.get("camera_type", "perspective") if key == "camera_path" else "perspective"
+    kind = content.get("camera_type") or "perspective" if key == "camera_path" else "perspective"
     if not isinstance(kind, str) or kind.lower() != "perspective":
         raise UserError(f"{path}: camera_type is {str(kind)[:40]}; films are perspective: export a perspective path")
     aspect = _aspect(path, content, overview)

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-FAR = 1024.0
-"""Distance from the origin, in world units, up to which scenes are taken as they are."""
+FAR = 1e5
+"""Distance from the origin, in world units, up to which scenes are taken as they are: 32 bits round it by 0.004."""
 ROUNDING = 1e-4
 """Largest error of a camera's place by rounding to 32 bits, as a share of the cameras' extent."""
 
@@ -26,7 +26,7 @@ def offset_of(viewmats: Sequence[np.ndarray]) -> np.ndarray | None:
         return None
     middle = np.median(centres, axis=0)
     distance, extent = np.abs(middle).max(), np.abs(centres - middle).max()
-    far = distance > FAR and distance * np.finfo(np.float32).eps > ROUNDING * extent > 0.0
+    far = distance > FAR and distance * np.finfo(np.float32).eps > ROUNDING * extent
     return np.rint(middle) if far else None
 
 

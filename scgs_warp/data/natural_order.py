@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from fractions import Fraction
 from pathlib import Path
 
-NUMBER = re.compile(r"([0-9]{9,}\.[0-9]+|[0-9]+)")
+NUMBER = re.compile(r"((?<![0-9.])1[0-9]{9}\.[0-9]+|[0-9]+)")
 """Whole numbers, and seconds since 1970 with their decimals; in shorter numbers a dot may separate anything."""
 
 

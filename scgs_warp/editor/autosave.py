@@ -104,12 +104,15 @@ class Autosave:
         if restore:
             with suppress(OSError, ValueError, UserError):
                 self.choice = read_text(self._choice_path, MAX_CHOICE)
+        moved = None
         if self.path.is_file():
             if restore:
                 self._restore()
             else:
-                self._move_aside(PREVIOUS)
+                moved = self._move_aside(PREVIOUS)
         self._saved = self._session.edit if self.said else Edit()
+        if moved is not None:
+            self.said = f"the edit that was kept is now {moved.name}"
         addresses.start(self._thread)
         self.note(self._session.edit)
 

@@ -36,15 +36,14 @@ Lpips = Callable[[Tensor, Tensor], Tensor | float]
 
 
 def _mean(values: list[float]) -> float | None:
-    """Return the mean, summed exactly so that the order of the images does not matter; None for an empty list. Images
-    without a valid pixel, whose score is not a number, do not count."""
-    known = [value for value in values if not math.isnan(value)]
-    return math.fsum(known) / len(known) if known else None
+    """Return the mean, summed exactly so that the order of the images does not matter; None for an empty list."""
+    return math.fsum(values) / len(values) if values else None
 
 
 def _decibels(image: Tensor, truth: Tensor) -> float:
     """Return the PSNR, at most ``MOST_DECIBELS``."""
-    return min(float(psnr(image, truth)), MOST_DECIBELS) if image.numel() else math.nan
+    value = float(psnr(image, truth))
+    return value if math.isnan(value) else min(value, MOST_DECIBELS)
 
 
 def _recolored(image: Tensor, color: Tensor) -> Tensor:
@@ -201,7 +200,6 @@ def evaluate(
 
 
 def _spread_of_psnr(rows: list[dict[str, Any]]) -> dict[str, float | None]:
-    rows = [row for row in rows if not math.isnan(row["psnr"])]
     worst = min(rows, key=lambda row: row["psnr"], default={})
     median = statistics.median(row["psnr"] for row in rows) if rows else None
     return {"psnr_median": median, "psnr_worst": worst.get("psnr"), "psnr_worst_time": worst.get("time")}

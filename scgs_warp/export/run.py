@@ -111,7 +111,7 @@ def _export_still(request: ExportRequest, device: str) -> str:
             with shortage_as_user_error(request.ply):
                 gaussians, when = keep_finite(stored.activate()), f"as in {request.ply}"
             if stored.left_out:
-                when += f", without {stored.left_out:,} that are not finite"
+                when += f", without {stored.left_out:,} that cannot be drawn"
     else:
         scene = _open(request, device)
         up, antialiased = scene.overview.up, scene.config.antialiased

@@ -169,7 +169,7 @@ class RunFolder:
         """
         if any((self.path / name).exists() for name in (FILE, PREVIOUS)):
             return False
-        if (self.path / SETTINGS).is_file():
+        if _has_settings(self.path / SETTINGS):
             return True
         return all(entry.name in BEFORE_SETTINGS or entry.match(".*.tmp") for entry in self.path.iterdir())
 

@@ -78,7 +78,7 @@ def test_flat_gaussians_are_kept_and_those_left_out_are_counted(tmp_path, capsys
     assert len(found) == 5 and found.left_out == 1
     assert (found.activate().scales[:3, 2] < 1e-29).all() and found.activate().scales.isfinite().all()
     assert app.cli(["--ply", str(path), "--output", str(tmp_path / "flat.splat"), "--device", "cpu"]) == 0
-    assert "5 Gaussians as in" in (out := capsys.readouterr().out) and "without 1 that are not finite" in out
+    assert "5 Gaussians as in" in (out := capsys.readouterr().out) and "without 1 that cannot be drawn" in out
 
 
 def test_a_file_is_edited_and_exported(tmp_path):

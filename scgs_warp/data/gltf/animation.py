@@ -116,7 +116,8 @@ def read_clips(file: GltfFile) -> list[Clip]:
 def _channel(file: GltfFile, animation: Any, channel: Any, where: str) -> Channel | None:
     target = channel.target
     node, path = (None, None) if target is None else (target.node, target.path)
-    pointer = ((target.extensions or {}).get(POINTER) or {}).get("pointer") if target is not None else None
+    extension = (target.extensions or {}).get(POINTER) if target is not None else None
+    pointer = extension.get("pointer") if isinstance(extension, dict) else None
     if isinstance(pointer, str) and (found := POINTED.fullmatch(pointer)) is not None:
         node, path = int(found[1]), found[2]
     if node is None or path not in (*PATHS, "weights"):

@@ -20,8 +20,8 @@ from ..lens import Lens, make_lens
 from ..natural_order import natural
 from .colmap_model import ModelCamera, ModelImage, find_model, read_model
 
-SECONDS = re.compile(r"(?:.*[^0-9.])?([0-9]{1,15}\.[0-9]{1,15})")
-"""Names that end with a decimal."""
+SECONDS = re.compile(r"(?:.*[^0-9.A-Za-z])?([0-9]{1,15}\.[0-9]{1,15})")
+"""Names that end with a decimal, which no letter precedes: ``cam1.0002`` is a camera and a frame."""
 MADE_FROM = "give the images that the model was made from, with their names"
 """What to do about missing images."""
 

@@ -139,10 +139,9 @@ def _of_split(path: Path, content: dict[str, Any], files: list[Path], indices: l
             )
     named = {known[item] for item in listed}
     if name == "train":  # what is held out is not trained on, though some exporters list all frames here
-        held = {known.get(item) for other in ("val", "test") for item in lists.get(other, []) if isinstance(item, str)}
-        if named <= held:
-            raise UserError(f"{path}: train_filenames are all among those of val or test; list others, too")
-        named -= held
+        others = [lists[other] for other in ("val", "test") if isinstance(lists.get(other), list)]
+        held = {known.get(item) for other in others for item in other if isinstance(item, str)}
+        named = named - held or named  # lists that all name every frame mean it
     chosen = sorted(named & set(indices))
     if not chosen:
         raise UserError(f"{path}: no frame of {name}_filenames is left; choose more frames, or restore their images")

@@ -10,7 +10,7 @@ class PartChanges {
     element("tracks").addEventListener("mousedown", (event) => {
       const name = event.target.closest(".name")?.dataset.handle;
       const handle = this.state.handles.find((one) => one.name === name);
-      if (!handle || event.detail !== 2) return;
+      if (!handle || event.detail !== 2 || event.button !== 0) return;
       event.preventDefault(); // the dialog keeps the focus
       this.rename(handle.part ?? handle.name, Boolean(handle.part));
     });
