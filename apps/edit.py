@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING
 from scgs_warp.apps.arguments import parse
 from scgs_warp.apps.cli import Device, prepare, run
 from scgs_warp.geometry.axes import Axis
-from scgs_warp.motion.static_nodes import MAX_COUNT
 
 if TYPE_CHECKING:
     from scgs_warp.edit import EditSession
@@ -76,6 +75,7 @@ def check(options: Options) -> None:
     """
     from scgs_warp.errors import UserError
     from scgs_warp.export.request import STILL_FORMATS, SUFFIXES, output_suffix
+    from scgs_warp.motion.static_nodes import MAX_COUNT
     from scgs_warp.visualization import video
 
     if (options.run is None) == (options.ply is None):

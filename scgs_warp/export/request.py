@@ -12,6 +12,7 @@ from ..formats.sog_files import META, check_folder
 from ..geometry.axes import Axis
 from ..storage.output_folders import make_parent
 from ..storage.suffixes import longest_suffix
+from ..visualization.video import SLOWEST
 
 Format = Literal[
     "ply",
@@ -192,8 +193,8 @@ def check_request(request: ExportRequest) -> None:
         raise UserError("--frames, --fps: an edit's film says how long it is; change film in the edit")
     if request.frames is not None and not 1 <= request.frames <= MAX_FRAMES:
         raise UserError(f"--frames {request.frames}: give 1 to {MAX_FRAMES}")
-    if request.fps is not None and not 0.01 <= request.fps <= 1000:
-        raise UserError(f"--fps {request.fps:g}: give 0.01 to 1000 frames a second")
+    if request.fps is not None and not SLOWEST <= request.fps <= 1000:
+        raise UserError(f"--fps {request.fps:g}: give {SLOWEST} to 1000 frames a second")
     _check_unused(request)
     _check_mesh(request)
     if request.max_mib is not None and not request.max_mib > 0:

@@ -25,6 +25,15 @@ def test_help(app):
     assert any(word in done.stdout for word in ("--device", "frame", "--preset"))
 
 
+def test_programs_start_without_torch():
+    """Its import takes seconds, for which --help and the refusal of an option would have to wait."""
+    modules = ", ".join(f"scgs_warp.apps.{app}" for app in console.APPS)
+    done = subprocess.run(
+        [sys.executable, "-c", f"import sys, {modules}; print('torch' in sys.modules)"], capture_output=True, text=True
+    )
+    assert done.stdout.strip() == "False", done.stderr
+
+
 def test_console_script():
     done = subprocess.run([sys.executable, "-m", "scgs_warp.apps", "view", "--help"], capture_output=True, text=True)
     assert done.returncode == 0 and "--output" in done.stdout

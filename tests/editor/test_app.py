@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import random
 import re
 import signal
@@ -13,32 +12,25 @@ from collections.abc import Iterator
 
 import numpy as np
 import pytest
-from PIL import Image
 
 from helpers.edit_scenes import bar_scene
-from helpers.studios import Page
+from helpers.studios import Page, bar_editor
 from helpers.web_clients import get, key, opens
-from scgs_warp.edit import EditSession, edit_file
+from scgs_warp.edit import edit_file
 from scgs_warp.edit.filming import film_view
 from scgs_warp.edit.rotations import from_axis, rotate, to_matrix
 from scgs_warp.editor import Editor
 from scgs_warp.editor.app import MAX_WAITING
-from scgs_warp.editor.autosave import Autosave
 from scgs_warp.editor.state import CURVE
-from scgs_warp.errors import UserError
 from scgs_warp.export.page_data import unpack
 from scgs_warp.formats.gaussian_ply import write_gaussian_ply
-from scgs_warp.geometry.cameras import orbit_camera
 
 pytest.importorskip("aiohttp", reason="the package aiohttp is not installed")
 
 
 @pytest.fixture
 def editor(tmp_path) -> Iterator[Editor]:
-    session = EditSession(bar_scene(nodes=60, gaussians=1500))
-    keeper = Autosave(session, tmp_path)
-    keeper.start(restore=True)
-    made = Editor(session, tmp_path, title="bar", port=0, autosave=keeper)
+    made = bar_editor(tmp_path, nodes=60, gaussians=1500)
     yield made
     made.stop()
 
@@ -333,47 +325,6 @@ def test_the_scene_has_parts_and_its_motion(editor):
     facts, columns = unpack(editor._content or b"")
     assert facts["edited"] and facts["nodes"] == 60 and len(facts["pose"]["chains"]) == len(facts["parts"])
     assert len(columns["part"]) == 60 and get(editor.server.port, "/scene").status == 403
-
-
-def test_a_scene_with_a_mask_is_edited(tmp_path):
-    session = EditSession(bar_scene(share=0.5))
-    keeper = Autosave(session, tmp_path)
-    keeper.start(restore=True)
-    editor = Editor(session, tmp_path, title="bar", port=0, autosave=keeper)
-    try:
-        raw = get(editor.server.port, "/scene", Cookie=key(editor.server))
-        assert raw.status == 200
-        facts, columns = unpack(editor._content or b"")
-        assert facts["masked"] and "share" in columns and len(columns["part"]) == facts["nodes"]
-    finally:
-        editor.stop()
-
-
-def test_a_picture_that_fails_is_answered(editor, page, monkeypatch, capfd):
-    camera = orbit_camera(editor.session.scene.overview, 40.0, 64)
-    asked = {"viewmat": camera.viewmat.tolist(), "K": camera.K.tolist(), "width": camera.width, "height": camera.height}
-    for error, said in ((UserError("no light"), "no light"), (RuntimeError("broken"), "internal error")):
-        monkeypatch.setattr("scgs_warp.editor.app.scene_jpeg", lambda *_, error=error: (_ for _ in ()).throw(error))
-        page.heard.clear()
-        page.send({"do": "picture", "at": 0.0, **asked})
-        for word in (said, "undrawn"):
-            page.until(lambda word=word: any(word in str(message) for message in page.heard))
-    assert "broken" in capfd.readouterr().err
-
-
-def test_pages_without_webgl_get_pictures(editor, page):
-    camera = orbit_camera(editor.session.scene.overview, 40.0, 64)
-    asked = {"viewmat": camera.viewmat.tolist(), "K": camera.K.tolist(), "width": camera.width, "height": camera.height}
-    page.send({"do": "picture", "at": 0.0, **asked})
-    page.until(lambda: page.pictures)
-    with Image.open(io.BytesIO(page.pictures[0])) as picture:
-        assert picture.size == (camera.width, camera.height)
-        bright = np.asarray(picture, np.float64).sum(2)
-    row, column = np.unravel_index(bright.argmax(), bright.shape)
-    page.ask("pick_pixel", pixel=[column + 0.5, row + 0.5], **asked)
-    assert page.state["selection"]
-    page.ask("pick_pixel", pixel=[1.0, 1.0], **asked)
-    assert not page.state["selection"]
 
 
 def test_only_its_own_pages_are_served(editor):

@@ -6,14 +6,26 @@ import asyncio
 import json
 import struct
 import threading
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from helpers.edit_scenes import bar_scene
 from helpers.web_clients import key
+from scgs_warp.edit import EditSession
 from scgs_warp.editor import Editor
+from scgs_warp.editor.autosave import Autosave
 
 PATIENCE = 60.0
+
+
+def bar_editor(folder: Path, **scene: Any) -> Editor:
+    """An editor of a bar (``edit_scenes.bar_scene``), whose edit is kept in a folder."""
+    session = EditSession(bar_scene(**scene))
+    keeper = Autosave(session, folder)
+    keeper.start(restore=True)
+    return Editor(session, folder, title="bar", port=0, autosave=keeper)
 
 
 class Page:
