@@ -26,7 +26,8 @@ PIXEL_BYTES = 64
 GIF_PIXEL_BYTES = 4
 """Bytes per pixel of each frame that a GIF keeps: colour and palette index."""
 SLOWEST = 0.01
-"""Least number of frames a second: a GIF's frame lasts at most 655 seconds."""
+"""Least number of frames a second. A GIF's frame lasts at most 655 seconds, and an MP4's rate is a fraction with a
+denominator of at most 1,000."""
 FRAME_NAME = "frame_{:05d}.png"
 FRAME_PATTERN = r"frame_\d{5,}\.png"
 
