@@ -38,7 +38,9 @@ PREVIEWS = "previews"
 SETTINGS, LOG = "config.json", "log.jsonl"
 RESULTS = ("metrics.json", "contact_sheet.png", "curves.png", "turntable.mp4", "evaluation")
 """What training writes after its last step."""
-PARTIAL = re.compile(r"\.(config\.json|log\.jsonl|contact_sheet\.png|curves\.png|turntable\.mp4|checkpoint.*)(\..*)?\.tmp")
+PARTIAL = re.compile(
+    r"\.(config\.json|log\.jsonl|contact_sheet\.png|curves\.png|turntable\.mp4|checkpoint.*)(\..*)?\.tmp"
+)
 """Names of files that a killed trainer leaves behind half written."""
 BEFORE_SETTINGS = {PREVIEWS, LOCK}
 """What a run directory holds before ``config.json``."""
