@@ -205,7 +205,7 @@ class Follower:
                     version = state["version"]
                     with self._changed:
                         self._known = version
-                    if version:
+                    if version not in (0, self._shown):  # a page that has just come may be told a version twice
                         self._take(await (await session.get(f"{root}/scene")).read())
                     with self._changed:
                         self._shown = version

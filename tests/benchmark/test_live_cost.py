@@ -30,3 +30,21 @@ def test_the_page_fetches_every_scene_and_says_when_it_was_closed():
     page._thread.join(10)
     with pytest.raises(UserError, match="the page was closed"):
         page.settle()
+
+
+def test_the_page_fetches_a_scene_once_even_if_it_is_told_of_it_twice():
+    """A page that comes just when a scene is published hears of it by the greeting and by the broadcast."""
+    live_cost = benchmark_script("live_cost")
+    with SceneView("training") as view:
+        view.publish(pack({"gaussians": 10}, []), "step 1")
+        page = live_cost.Follower(view.server.url)
+        view.say("step 1")
+        for number in (2, 3):
+            view.publish(pack({"gaussians": 10}, []), f"step {number}")
+            view.say(f"step {number}, again")
+            end = time.monotonic() + 60
+            while page.scenes < number:
+                page.settle()
+                assert time.monotonic() < end
+            time.sleep(0.3)
+            assert page.scenes == number
