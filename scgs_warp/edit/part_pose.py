@@ -24,6 +24,8 @@ from .solver import ArapSolver
 FREE_RINGS = 3
 """Number of rings of control points on either side of a turned joint that are free; fewer on a short part, so that some
 of its control points are held."""
+HELD_SHARE = 0.25
+"""Least share of a body's control points that are held: a single one beyond the free rings would not turn the body."""
 INNER_STIFFNESS = 0.03
 """Stiffness (edges have 1) with which a short body between two others is pulled to its place. The bodies at its ends
 place it already; held firmly, it would leave the surface little room to bend."""
@@ -188,8 +190,8 @@ class PartPoser:
         )
 
     def _held_nodes(self, body: Sequence[int]) -> tuple[np.ndarray, frozenset[int]]:
-        """Return which control points are held, [M] bool: those more than ``FREE_RINGS`` from every other body; of a
-        body that does not reach so far, those furthest away. Also return the bodies that are so short."""
+        """Return which control points are held, [M] bool: those more than ``FREE_RINGS`` from every other body, and of a
+        body that has few of these, those furthest away. Also return the bodies that have none."""
         key = tuple(body)
         found = self._held.get(key)
         if found is None:
@@ -199,7 +201,7 @@ class PartPoser:
             for label in set(body):
                 own = of_node == label
                 most = int(rings[own].max())
-                held |= own & (rings >= most)
+                held |= own & (rings >= np.quantile(rings[own], 1.0 - HELD_SHARE, method="lower"))
                 short |= {label} if most <= FREE_RINGS else set()
             if len(self._held) >= 64:
                 self._held.clear()

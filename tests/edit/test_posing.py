@@ -10,7 +10,7 @@ from scgs_warp.data.synthetic.figure_motion import bone_transforms
 from scgs_warp.edit import EditSession
 from scgs_warp.edit.handles import STAY
 from scgs_warp.edit.part_pose import FREE_RINGS, INNER_STIFFNESS, PartMove, _rings_to_others
-from scgs_warp.edit.rotations import from_axis, logarithm, rotate, to_matrix
+from scgs_warp.edit.rotations import from_axis, logarithm, rigid_fit, rotate, to_matrix
 from scgs_warp.edit.skeleton import Part, Skeleton, strongest
 from scgs_warp.errors import UserError
 
@@ -193,6 +193,22 @@ def test_a_short_body_between_two_others_is_pulled_not_held(session):
     found = stiffness()
     assert found.pop("shoulder_left") == INNER_STIFFNESS
     assert "elbow_left" in found and set(found.values()) == {None}
+
+
+@pytest.mark.parametrize("tips", [1, 6, 20])
+def test_a_part_between_two_others_keeps_its_turn(session, tips):
+    """A small turn of what hangs on a part leaves few of its control points far from both: they must still turn it."""
+    part = next(part for part in session.parts() if part.name == "head")
+    start = session.node_positions(0.0)
+    highest = np.array(part.nodes)[np.argsort(start[list(part.nodes), 2])[::-1][:tips]]
+    session.split_part("head", highest.tolist(), "hat")
+    own = sorted(set(part.nodes) - set(highest.tolist()))
+    session.turn("head", 50, (0, 0, 1))
+    alone = session.node_positions(0.0)[own]
+    session.turn("hat", 5, (1, 0, 0))
+    turns = [rigid_fit(start[own], posed)[0] for posed in (alone, session.node_positions(0.0)[own])]
+    degrees = [float(np.degrees(np.linalg.norm(logarithm(turn)))) for turn in turns]
+    assert degrees[0] > 40 and degrees[1] > degrees[0] - 3, degrees
 
 
 def test_rings_are_numbers_of_edges(session):
