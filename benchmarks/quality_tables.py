@@ -355,6 +355,7 @@ WRITERS: dict[str, Callable[[Source], str]] = {
     "fast-parts": change_of_defaults,
     "halved": change_of_defaults,
     "faint": change_of_defaults,
+    "background": change_of_defaults,
     "levers": levers,
     "levers-today": differences,
     "exposure": exposure,

@@ -140,8 +140,7 @@ class PretrainConfig:
     """Step at which spheres are no longer densified and pruned; farthest-point sampling of trajectories then reduces
     them to N_p."""
     warm_up: int = milestone(50)
-    """Number of steps before the network starts to move the spheres. After long at rest, only spheres of parts that
-    hardly move are left."""
+    """Step at which the network starts to move the spheres. Long at rest, only those of parts that hardly move stay."""
     densify_every: int = bounded(100, 1)
     """Number of steps between two rounds of densification."""
     densify_by: Literal["share", "gradient"] = newer("share", before="share")
@@ -170,8 +169,7 @@ class PretrainConfig:
     """Neighbours of ARAP: over the whole time (track, supplement), at the first time compared if they stay (moment), or
     (auto) by track, then for cut-out subjects that are not thin a second time by moment (``training.second_try``)."""
     random_background: bool = True
-    """Change the background in every step if the data has alpha, so that black cloth is not mistaken for empty
-    space."""
+    """Change the background in every step if the data has alpha: black cloth is then not taken for empty space."""
     silhouette: float = newer(0.5, before=0.0, least=0, most=1e6)
     """Weight of the distance between the spheres' projected centres and the silhouette (not in the paper), in units of
     the image's width; needs alpha. It brings spheres to thin and fast parts, which the photometric loss makes
@@ -210,8 +208,8 @@ class DensifyConfig:
     """Largest number of rounds in total (0: no limit): three times as many double the number of Gaussians without
     improving the images."""
     grad_threshold: float = bounded(1.4e-4, 0)
-    """Gradient of the loss with respect to the 2D mean above which Gaussians are densified, in normalised device
-    coordinates, at 800 pixels (official code: 2e-4 at any size)."""
+    """Gradient of the 2D mean, in normalised device coordinates, above which Gaussians are densified, for images of 800
+    pixels (official code: 2e-4 at any size)."""
     resolution_exponent: float = bounded(0.66, 0, 10)
     """Exponent of (800 / image size), by which the threshold is multiplied: in small images, each Gaussian has larger
     gradients."""
@@ -236,8 +234,7 @@ class DensifyConfig:
     many as have together at most this share of the contributions of all (of each the largest to a sampled view). 0:
     off."""
     prune_large: Literal["auto", "always", "never"] = "auto"
-    """Apply max_screen and max_scale. auto: only if the images have alpha, because images without alpha show bare
-    walls, which need large Gaussians."""
+    """Apply max_screen and max_scale. auto: only with alpha, because others show bare walls, of large Gaussians."""
     max_screen: float = bounded(0.05, 0, 1e3)
     """Prune Gaussians that cover more than this share of the image (after the first opacity reset). 0: off."""
     max_scale: float = bounded(0.1, 0, 1e3)
@@ -273,6 +270,9 @@ class LossConfig:
 
     ssim: float = bounded(0.2, 0, 1)
     """Weight of D-SSIM; L1 has the rest."""
+    random_background: float = newer(0.5, before=0.0, least=0, most=1)
+    """Share of the main stage until which the background changes in every step if the data has alpha (not in the
+    paper): Gaussians of its colour beside the subject would change no training image."""
     log_error: float = newer(0.002, before=0.0, least=0, most=1e3)
     """Weight of the logarithm of each view's mean squared error (not in the paper), which weighs views by their
     relative error, as PSNR does."""

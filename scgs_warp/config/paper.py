@@ -131,6 +131,7 @@ PAPER = TrainConfig(
     ),
     loss=LossConfig(
         ssim=0.2,
+        random_background=0.0,
         log_error=0.0,
         log_error_from=0.5,
         pooled="never",

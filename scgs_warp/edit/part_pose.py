@@ -190,8 +190,8 @@ class PartPoser:
         )
 
     def _held_nodes(self, body: Sequence[int]) -> tuple[np.ndarray, frozenset[int]]:
-        """Return which control points are held, [M] bool: those more than ``FREE_RINGS`` from every other body, and of a
-        body that has few of these, those furthest away. Also return the bodies that have none."""
+        """Return which control points are held, [M] bool: those more than ``FREE_RINGS`` from every other body, and of
+        a body that has few of these, those furthest away. Also return the bodies that have none."""
         key = tuple(body)
         found = self._held.get(key)
         if found is None:

@@ -110,7 +110,7 @@ def prepare(state: TrainState, frames: Frames, view: int = 0) -> View:
     pretraining = state.stage == "pretrain"
     progressive = config.pretrain.progressive and pretraining
     index = frames.index_at(step, progressive, view)
-    random_background = pretraining and config.pretrain.random_background
+    random_background = varies_background(state)
     loaded = frames.view(index, state.step, random_background, seeks_silhouettes(state), view)
     later, next_view = divmod(view + (1 if state.group is None else state.group.size), config.batch)
     frames.expect(step + later, progressive, next_view)
@@ -191,6 +191,15 @@ def seeks_silhouettes(state: TrainState) -> bool:
     """Return True during the steps of stage 1 in which silhouettes draw the spheres: once the spheres move."""
     pretrain = state.config.pretrain
     return state.stage == "pretrain" and state.stage_step >= pretrain.warm_up and pretrain.silhouette > 0
+
+
+def varies_background(state: TrainState) -> bool:
+    """Return True during the steps whose background is random: of stage 1, or until ``loss.random_background`` of the
+    main stage."""
+    config = state.config
+    if state.stage == "pretrain":
+        return config.pretrain.random_background
+    return state.stage_step < round(config.loss.random_background * config.main_steps)
 
 
 def sh_degree(state: TrainState, step: int) -> int:

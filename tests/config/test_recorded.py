@@ -65,6 +65,7 @@ def test_best_is_the_former_paper_in_half_the_steps():
         "densify.faint_share": 0.01,
         "loss.depth": 0.2,
         "loss.stereo": True,
+        "loss.random_background": 0.5,
         "motion.bfloat16_adjoint": True,
     }
     assert {name: best[name] for name in best.keys() - values.keys()} == {**newer, **added}
@@ -75,6 +76,7 @@ def test_a_recorded_configuration_keeps_what_it_did(name):
     values = json.loads((OLD / f"{name}.json").read_text())
     read = presets.to_dict(presets.from_dict(values))
     assert read["loss"].pop("log_error") == 0.0 and read["sharpness"] == 0.0
+    assert not read["loss"]["random_background"]
     assert not read["motion"]["tints"] and not read["motion"]["correctives"]
     for section, fields in values.items():
         own = read[section]

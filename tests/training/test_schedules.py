@@ -23,7 +23,7 @@ from scgs_warp.training.density_control import (
 )
 from scgs_warp.training.frames import view_number
 from scgs_warp.training.step import motion_frozen
-from scgs_warp.training.view import log_weight, seeks_silhouettes, sh_degree
+from scgs_warp.training.view import log_weight, seeks_silhouettes, sh_degree, varies_background
 
 STEADY = {"sh_dc": 2.5e-3, "sh_rest": 1.25e-4, "opacity_logits": 0.05, "log_scales": 5e-3, "quats": 1e-3}
 STEADY |= {"shading": 2.5e-3, "correctives": 8e-4}
@@ -135,6 +135,8 @@ class Milestones(NamedTuple):
     """First steps with harmonics of degree 1, 2 and 3."""
     log_error: int
     """First step with the logarithm of the error in the loss."""
+    background: int
+    """First step on the background of the data."""
     rounds: range
     resets: list[int]
     control_points: list[int]
@@ -145,15 +147,15 @@ class Milestones(NamedTuple):
 
 MILESTONES: dict[PresetName, Milestones] = {
     "quick": Milestones(
-        5_200, 1_800, 117, (146, 292, 438), 2_600, range(200, 3_501, 100), [875, 1_750, 2_625],
+        5_200, 1_800, 117, (146, 292, 438), 2_600, 2_600, range(200, 3_501, 100), [875, 1_750, 2_625],
         [600, 1_200, 1_800, 2_400], 100, [*range(100, 1_500, 100)],
     ),
     "cpu": Milestones(
-        21_000, 3_000, 400, (500, 1_000, 1_500), 10_500, range(400, 12_001, 100), [3_000, 6_000, 9_000],
+        21_000, 3_000, 400, (500, 1_000, 1_500), 10_500, 10_500, range(400, 12_001, 100), [3_000, 6_000, 9_000],
         [2_000, 4_000, 6_000, 8_000], 100, [*range(100, 2_000, 100)],
     ),
     "best": Milestones(
-        35_000, 5_000, 1_500, (750, 1_500, 2_250), 20_300, range(300, 19_951, 150), [5_000, 10_000, 15_000],
+        35_000, 5_000, 1_500, (750, 1_500, 2_250), 20_300, 17_500, range(300, 19_951, 150), [5_000, 10_000, 15_000],
         [2_550, 5_100, 7_500, 10_050, 12_600], 50, [50, *range(100, 3_750, 100)],
     ),
 }  # fmt: skip
@@ -176,10 +178,12 @@ def test_milestones_of_stage_2(name):
         state.step = config.pretrain_steps + step
         changes.setdefault(("frozen", motion_frozen(state)), step)
         changes.setdefault(("log error", log_weight(state)), step)
+        changes.setdefault(("varied", varies_background(state)), step)
         changes.setdefault(("density", density_due(state)), step)
         assert not (density_due(state) and step + 1 > growth.until), "densification ends"
     assert changes["frozen", False] == table.freeze and changes["frozen", True] == 0
     assert changes["log error", config.loss.log_error] == table.log_error and changes["log error", 0.0] == 0
+    assert changes["varied", False] == table.background and changes["varied", True] == 0
     assert changes["density", True] == table.rounds[0] - 1
 
 

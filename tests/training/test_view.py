@@ -1,26 +1,32 @@
-"""What a step asks of one view: statistics, the pooled residual, an instant within the film."""
+"""What a step asks of one view: statistics, the pooled residual, the background, an instant within the film."""
 
 from __future__ import annotations
 
 from types import SimpleNamespace
 
 import pytest
+import torch
 
 from helpers.tiny import tiny_config, tiny_dataset
 from scgs_warp.training.frames import Frames
 from scgs_warp.training.state import TrainState
-from scgs_warp.training.view import Form, noisy_time, prepare
+from scgs_warp.training.view import Form, Numbers, View, compare, noisy_time, prepare
 
 
-def form_at(step: int, **changes) -> Form:
-    """The form of a view at ``step`` of 50, of which 10 are of stage 1."""
-    changes["pretrain"] = {"steps": 10, "warm_up": 4, **changes.get("pretrain", {})}
+def view_at(step: int, **changes) -> tuple[TrainState, View]:
+    """The view of ``step``, of 50 of which 10 are of stage 1, and the state."""
     data = tiny_dataset(3)
+    changes["pretrain"] = {"steps": 10, "warm_up": 4, **changes.get("pretrain", {})}
     state = TrainState.begin(tiny_config(50, **changes), data, "cpu")
     if step >= 10:
         state.begin_main()
     state.step = step
-    return prepare(state, Frames(data, state.normalisation, state.config, "cpu")).form
+    return state, prepare(state, Frames(data, state.normalisation, state.config, "cpu"))
+
+
+def form_at(step: int, **changes) -> Form:
+    """The form of the view of ``step``."""
+    return view_at(step, **changes)[1].form
 
 
 @pytest.mark.parametrize(("step", "collects"), [(0, True), (9, True), (10, True), (33, True), (34, False), (49, False)])
@@ -34,6 +40,35 @@ def test_each_stage_has_its_own_pooled_residual(stage_1, stage_2):
     changes = {"pretrain": {"pooled": stage_1}, "loss": {"pooled": stage_2}}
     assert form_at(5, **changes).pooled == stage_1
     assert form_at(15, **changes).pooled == (stage_2 == "always")
+
+
+@pytest.mark.parametrize("stage_1", [True, False])
+@pytest.mark.parametrize(("share", "until"), [(0.0, 10), (0.5, 30), (1.0, 50)])
+def test_each_stage_has_its_own_choice_of_the_background(stage_1, share, until):
+    changes = {"pretrain": {"random_background": stage_1}, "loss": {"random_background": share}}
+    for step in (5, 9, 10, 29, 30, 49):
+        _, view = view_at(step, **changes)
+        assert bool(view.background.any()) == (stage_1 if step < 10 else step < until)
+
+
+def test_every_step_has_another_background():
+    assert not torch.equal(view_at(20)[1].background, view_at(21)[1].background)
+
+
+@pytest.mark.parametrize("random", [True, False])
+def test_black_beside_the_subject_is_seen_on_other_backgrounds_alone(random):
+    """A black Gaussian on black changes no image: no gradient would ever remove it."""
+    state, view = view_at(12, loss={"random_background": float(random)})
+    gaussians = state.gaussians
+    with torch.no_grad():
+        gaussians.means[:1] = torch.tensor([0.0, 0.0, -1.5])  # below the subject
+        gaussians.log_scales[:1] = -2.5
+        gaussians.sh_dc[:1] = -0.5 / 0.28209479177387814
+        gaussians.opacity_logits[1:] = -20.0
+    numbers = Numbers(view.camera, view.background, torch.tensor(view.plan.times), view.plan.weight)
+    compare(state, view, numbers, state.stats).loss.backward()
+    gradient = gaussians.opacity_logits.grad
+    assert gradient is not None and (float(gradient[0]) > 0.0) == random and (float(gradient[0]) != 0.0) == random
 
 
 @pytest.mark.parametrize("end", [0.0, 1.0])
