@@ -26,6 +26,10 @@ from .frames import Frames, view_number
 from .silhouettes import SilhouetteSample, silhouette_term
 from .state import TrainState
 
+VARIED_LATER = 4
+"""Interval of the steps on a random background once most are on that of the data: enough to keep what lies beside the
+subject transparent."""
+
 
 class View(NamedTuple):
     """What a step needs of one view. ``form`` and the shapes decide which operations the step consists of."""
@@ -194,12 +198,13 @@ def seeks_silhouettes(state: TrainState) -> bool:
 
 
 def varies_background(state: TrainState) -> bool:
-    """Return True during the steps whose background is random: of stage 1, or until ``loss.random_background`` of the
-    main stage."""
-    config = state.config
+    """Return True in steps whose background is random: those of stage 1, of the main stage until
+    ``loss.random_background``, and every ``VARIED_LATER``-th from then on."""
+    config, step = state.config, state.stage_step
     if state.stage == "pretrain":
         return config.pretrain.random_background
-    return state.stage_step < round(config.loss.random_background * config.main_steps)
+    until = round(config.loss.random_background * config.main_steps)
+    return step < until or (until > 0 and step % VARIED_LATER == 0)
 
 
 def sh_degree(state: TrainState, step: int) -> int:
