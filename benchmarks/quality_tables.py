@@ -20,6 +20,7 @@ from literature_tables import Column, Literature, literature_table, read_literat
 from markdown_table import duration, number, percent, signed, table, thousands
 from provenance import OLDER, REPORTED, TRAINING, changed_since, older_note, reported_note
 from zoo_tables import (
+    backgrounds,
     change_of_defaults,
     clips,
     crossing,
@@ -355,7 +356,7 @@ WRITERS: dict[str, Callable[[Source], str]] = {
     "fast-parts": change_of_defaults,
     "halved": change_of_defaults,
     "faint": change_of_defaults,
-    "background": change_of_defaults,
+    "background": backgrounds,
     "levers": levers,
     "levers-today": differences,
     "exposure": exposure,

@@ -36,6 +36,21 @@ def change_of_defaults(source: Source) -> str:
     return table(head, [[name, *row] for name, row in zip(names, cells)])
 
 
+def backgrounds(source: Source) -> str:
+    """Write scores and the alpha outside the subject, without and with a background that changes in the main stage."""
+    both = ("before", "after")
+    rows = []
+    for scene in (*ZOO, "figure", "player"):
+        if all(source.run(row, scene) for row in both):
+            before, after = (source.run(row, scene) for row in both)
+            scores = [number(run[key], 2) for key in ("psnr", "psnr_worst") for run in (before, after)]
+            outside = [percent(100 * run["extra"], 3) for run in (before, after)]
+            rows.append([scene, *scores, *outside, *(thousands(run["gaussians"], 1) for run in (before, after))])
+    marked = [source.label(row, row) for row in both]
+    heads = ("", "worst image, ", "alpha outside the subject, ", "Gaussians, ")
+    return table(["", *(head + text for head in heads for text in marked)], rows)
+
+
 ALTERNATIVES = {
     "arap": "ARAP 1e-2 to the end",
     "nodes-512": "512 control points",

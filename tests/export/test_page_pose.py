@@ -85,6 +85,28 @@ def test_control_points_bend_as_those_of_the_session(degrees, browser, figure):
     visit.context.close()
 
 
+def test_a_part_keeps_its_turn_when_what_hangs_on_it_turns_too(browser, figure):
+    session, path = figure
+    visit, unit = Visit(browser, path), session.scene.normalisation
+    for name in limbs(session)[:3]:
+        session.reset()
+        session.turn(session.chain(name)[1], 60.0, (0.0, 1.0, 0.0))
+        session.turn(name, 5.0, (1.0, 0.0, 0.0))
+        turns = [[row(session, h.part), list(session.edit.targets[h.name].rotation)] for h in session.edit.handles]
+        found = visit.ask(
+            """(() => { const { figure } = player;
+            figure.reset();
+            for (const [row, turn] of argument) figure.turns[row] = turn;
+            player.pose(0, new Float32Array(player.table.length), true);
+            return Array.from(figure.shape.points); })()""",
+            turns,
+        )
+        points = (session.node_positions(0.0) - unit.centre.tolist()) * unit.scale
+        apart = np.linalg.norm(np.reshape(found, (-1, 3)) - points, axis=1) / session.graph.edge_length
+        assert apart.max() < 6e-3
+    visit.context.close()
+
+
 def test_a_pull_is_that_of_the_session(browser, figure):
     session, path = figure
     session.reset()

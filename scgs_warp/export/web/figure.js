@@ -2,8 +2,9 @@
 // the control points between the bodies, which the solver bends.
 
 const FREE_RINGS = 3; // on either side of a turned joint
+const HELD_SHARE = 0.25; // of a body's control points, at least
 const INNER_STIFFNESS = 0.03; // of a short body between two others
-const FEW = 3; // control points that show no rotation by themselves
+const FEW = 4; // control points, below which they show no rotation by themselves
 const STEP_ANGLE = Math.PI / 12, LONGEST_PATH = 48;
 
 class Figure {
@@ -101,7 +102,7 @@ class Figure {
     return { found, body };
   }
 
-  // Control points that their bodies hold: those far from other bodies, or as far as there are any.
+  // Control points that their bodies hold: those far from other bodies, or the furthest if these are few.
   held(body) {
     const { graph, count } = this, label = Array.from(this.owner, (row) => body[row]);
     const rings = new Uint8Array(count).fill(FREE_RINGS + 1);
@@ -124,9 +125,13 @@ class Figure {
       }
       front = next;
     }
-    const most = {};
-    for (let m = 0; m < count; m++) most[label[m]] = Math.max(most[label[m]] ?? 0, rings[m]);
-    return { label, most, held: rings.map((ring, m) => (ring >= most[label[m]] ? 1 : 0)) };
+    const most = {}, least = {};
+    for (const body of new Set(label)) {
+      const own = rings.filter((_, m) => label[m] === body).sort();
+      most[body] = own[own.length - 1];
+      least[body] = own[Math.floor((own.length - 1) * (1 - HELD_SHARE))];
+    }
+    return { label, most, held: rings.map((ring, m) => (ring >= least[label[m]] ? 1 : 0)) };
   }
 
   anchors(found, body) {
