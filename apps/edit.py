@@ -74,7 +74,7 @@ def check(options: Options) -> None:
         UserError: names the option and the remedy.
     """
     from scgs_warp.errors import UserError
-    from scgs_warp.export.request import STILL_FORMATS, SUFFIXES, output_suffix
+    from scgs_warp.export.request import STILL_FORMATS, SUFFIXES, check_output, output_suffix
     from scgs_warp.motion.static_nodes import MAX_COUNT
     from scgs_warp.visualization import video
 
@@ -97,16 +97,19 @@ def check(options: Options) -> None:
         raise UserError(
             f"--clip {options.clip}: a run has no clips; leave it out, or give a glTF character to --motion"
         )
-    if options.output is not None:
-        if options.script is None and options.motion is None:
-            raise UserError(f"--output {options.output}: a film needs --script or --motion")
-        video.check_path(options.output)
-    if options.export is not None and output_suffix(options.export) not in [SUFFIXES[kind] for kind in STILL_FORMATS]:
+    if options.output is not None and options.script is None and options.motion is None:
+        raise UserError(f"--output {options.output}: a film needs --script or --motion")
+    kinds = {SUFFIXES[kind]: kind for kind in STILL_FORMATS}
+    if options.export is not None and output_suffix(options.export) not in kinds:
         raise UserError(f"--export {options.export}: end the name in .ply, .compressed.ply, .splat, .spz, .sog or .glb")
     if not 0 <= options.port <= 65535:
         raise UserError(f"--port {options.port}: give 1 to 65535, or 0 for any")
     if options.at is not None and not 0 <= options.at <= 3600:
         raise UserError(f"--at {options.at:g}: give a second of the film, from 0 to 3600")
+    if options.output is not None:
+        video.check_path(options.output)
+    if options.export is not None:
+        check_output(options.export, kinds[output_suffix(options.export)], "--export")
 
 
 def open_session(options: Options, device: str) -> EditSession:

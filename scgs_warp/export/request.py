@@ -56,7 +56,7 @@ MESH_SUFFIXES = (".obj", ".stl", ".ply", ".glb")
 """Suffixes of meshes. The last two select Gaussians unless ``--format mesh`` is given."""
 OTHER_SUFFIXES = {".htm": ".html", ".stl": ".obj", "meta.json": ".sog"}
 """Alternative suffixes, and a whole name: a SOG that is not bundled."""
-STILL_FORMATS = ("ply", "compressed.ply", "splat", "spz", "sog", "glb")
+STILL_FORMATS: tuple[Format, ...] = ("ply", "compressed.ply", "splat", "spz", "sog", "glb")
 """Formats of Gaussians at one instant; ``glb`` holds the motion if no instant is given."""
 SEQUENCES = ("ply-sequence", "sog-sequence")
 FRAME_FORMATS = (*SEQUENCES, "tracks", "4dgs")
@@ -246,8 +246,8 @@ def _check_mesh(request: ExportRequest) -> None:
         raise UserError(f"--sequence: --output {request.output} holds one instant; a moving mesh is a .glb")
 
 
-def check_output(path: Path, kind: Format) -> None:
-    """Check that the output can be written; make missing folders.
+def check_output(path: Path, kind: Format, option: str = "--output") -> None:
+    """Check that the output can be written; make missing folders. Errors name the option.
 
     Raises:
         UserError: the suffix is wrong, a file or folder is in the way, or the folder cannot be written.
@@ -256,11 +256,11 @@ def check_output(path: Path, kind: Format) -> None:
     choices = {"tracks": TRACK_SUFFIXES, "mesh": MESH_SUFFIXES}.get(kind, (ending,))
     if ending and suffix not in choices:
         longer = f", not in {suffix}," if suffix.endswith(ending) else f" (not {META})" if path.name == META else ""
-        raise UserError(f"--output {path}: end the name in {' or '.join(choices)}{longer} for --format {kind}")
+        raise UserError(f"{option} {path}: end the name in {' or '.join(choices)}{longer} for --format {kind}")
     if ending and path.is_dir():
-        raise UserError(f"--output {path}: is a folder; give another name")
+        raise UserError(f"{option} {path}: is a folder; give another name")
     if not ending and path.exists() and not path.is_dir():
-        raise UserError(f"--output {path}: is a file; name a folder for --format {kind}")
+        raise UserError(f"{option} {path}: is a file; name a folder for --format {kind}")
     if path.name.lower() == META:
         check_folder(path)
     make_parent(path)

@@ -46,6 +46,21 @@ def test_the_app_films_and_exports(tmp_path, ply, capsys):
         assert float(torch.cdist(read_gaussian_ply(export).means, found).min(dim=1).values.max()) < 0.01
 
 
+@pytest.mark.parametrize("name", ["out.ply", "out.glb", "out.compressed.ply", "out.splat", "out.spz", "out.sog"])
+def test_the_folder_of_an_export_is_made(tmp_path, ply, name):
+    assert app.cli(["--ply", str(ply), "--nodes", "40", "--export", str(tmp_path / "new" / "folder" / name)]) == 0
+    assert (tmp_path / "new" / "folder" / name).stat().st_size > 500
+
+
+@pytest.mark.parametrize("option", ["--export=file/x.glb", "--output=file/x.mp4"])
+def test_a_folder_that_cannot_be_made_is_refused_before_the_scene_is_loaded(tmp_path, monkeypatch, capsys, option):
+    monkeypatch.chdir(tmp_path)
+    Path("file").write_text("a file")
+    assert app.cli(["--ply", "missing.ply", "--script", "x", option]) == 2
+    error = capsys.readouterr().err
+    assert error.count("\n") == 1 and "file: cannot be written" in error and "missing" not in error
+
+
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
