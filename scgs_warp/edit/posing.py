@@ -50,7 +50,7 @@ class Posing:
                 found = self._find(None)
                 with contextlib.suppress(UserError):  # a folder that nobody may write to is read only
                     if path is not None:
-                        skeleton_file.write(path, found, scene)
+                        skeleton_file.replace(path, found, scene)
             self._found[None] = found
         return found
 
@@ -100,7 +100,7 @@ class Posing:
         path = self._skeleton_path()
         if path is None:
             raise UserError("the scene comes from no run folder; save the edit, which holds its skeleton")
-        skeleton_file.write(path, self.skeleton, edit_file.scene_of(self.engine))
+        skeleton_file.replace(path, self.skeleton, edit_file.scene_of(self.engine))
         self._found[None] = self.skeleton
         return path
 

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import json
 from pathlib import Path
 from typing import Any, get_args
 
+from ..errors import UserError
 from ..storage.files import write_atomically
 from .field_reader import FieldReader, one_line, read_object, show_value
 from .skeleton import Part, Skeleton, Source, unit_axis
 
 FILE = "skeleton.json"
+FORMER = ".former.json"
+"""Ending of the copy of a skeleton that somebody edited for other control points."""
 FORMAT = "scgs-warp skeleton"
 VERSION = 1
 
@@ -90,6 +94,21 @@ def write(path: Path, skeleton: Skeleton, scene: dict[str, Any]) -> None:
     """
     content = {"format": FORMAT, "version": VERSION, "scene": scene, **to_plain(skeleton)}
     write_atomically(path, (json.dumps(content, indent=1) + "\n").encode())
+
+
+def replace(path: Path, skeleton: Skeleton, scene: dict[str, Any]) -> None:
+    """Write a skeleton as ``write`` does. An edited one of other control points that stands there is kept beside it,
+    since its names cannot be found again.
+
+    Raises:
+        UserError: a file cannot be written; the former one stays in place.
+    """
+    former: dict[str, Any] = {}
+    with contextlib.suppress(UserError):  # what is no JSON object holds no names
+        former = read_object(path)
+    if former and former.get("source", "edited") == "edited" and former.get("scene") != scene:
+        write_atomically(path.with_suffix(FORMER), (json.dumps(former, indent=1) + "\n").encode())
+    write(path, skeleton, scene)
 
 
 def read(path: Path, scene: dict[str, Any]) -> Skeleton | None:

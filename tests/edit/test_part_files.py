@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 
 import numpy as np
 import pytest
 
 from helpers.edit_scenes import bar_scene
-from scgs_warp.edit import EditSession
+from scgs_warp.edit import EditSession, skeleton_file
 from scgs_warp.errors import UserError
 
 
@@ -56,6 +57,30 @@ def test_a_script_may_name_a_part_alone(tmp_path):
     assert session.edit.skeleton == session.skeleton
     assert session.edit.handles[0].nodes == session.skeleton.part("part-2").nodes
     assert not np.array_equal(session.node_positions(0.5), EditSession(bar_scene()).node_positions(0.5))
+
+
+def test_an_edited_skeleton_of_other_control_points_is_kept_beside_the_new_one(tmp_path):
+    def opened(count: int) -> EditSession:
+        scene = bar_scene()
+        scene.folder = tmp_path
+        file.write_text(json.dumps({**content, "scene": {"control_points": count, "fingerprint": "00000000"}}))
+        return EditSession(scene)
+
+    session = EditSession(bar_scene())
+    file, former = tmp_path / "skeleton.json", tmp_path / "skeleton.former.json"
+    content = {"format": "scgs-warp skeleton", "version": 1, **skeleton_file.to_plain(session.skeleton)}
+    assert opened(7).skeleton and not former.exists(), "what was found can be found again"
+    content["source"], content["parts"][0]["name"] = "edited", "left half"
+    for count in (7, 8):
+        assert "left half" not in opened(count).skeleton.names
+        kept = json.loads(former.read_text())
+        assert kept["parts"][0]["name"] == "left half" and kept["scene"]["control_points"] == count
+        assert json.loads(file.read_text())["scene"]["fingerprint"] != "00000000"
+    renamed = opened(9)
+    renamed.edit = dataclasses.replace(renamed.edit, skeleton=session.skeleton.renamed(session.skeleton.names[0], "x"))
+    renamed.save_skeleton()
+    renamed.save_skeleton()
+    assert json.loads(former.read_text())["scene"]["control_points"] == 9, "a skeleton of this scene is no former one"
 
 
 def test_a_run_keeps_its_skeleton(tmp_path):
