@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import torch
@@ -11,6 +12,7 @@ from scipy.sparse import coo_matrix, csr_matrix
 from scipy.sparse.csgraph import connected_components
 from torch import Tensor
 
+from ..errors import UserError
 from ..ops.arap import trajectory_graph
 from .rotations import rotate
 
@@ -175,3 +177,26 @@ def _strays(tracks: np.ndarray, component: np.ndarray, reach: float) -> np.ndarr
 def sample_times(moves: bool) -> Tensor:
     """Return the instants at which ``build_graph`` compares trajectories."""
     return torch.linspace(0.0, 1.0, SAMPLE_COUNT) if moves else torch.zeros(1)
+
+
+def chosen_nodes(nodes: Iterable[Any], count: int) -> tuple[int, ...]:
+    """Return the chosen of ``count`` control points, ascending.
+
+    Args:
+        nodes: whole numbers, or a boolean for every control point.
+
+    Raises:
+        UserError: one is no whole number or does not exist, or the booleans are not as many as the control points.
+    """
+    given = nodes.tolist() if isinstance(nodes, np.ndarray | Tensor) else list(nodes)
+    given = [node.item() if isinstance(node, np.generic | Tensor) else node for node in given]
+    if given and all(isinstance(node, bool) for node in given):
+        if len(given) != count:
+            raise UserError(f"a mask of {len(given)} control points: there are {count}; give one boolean for each")
+        return tuple(index for index, chosen in enumerate(given) if chosen)
+    for node in given:
+        if isinstance(node, bool) or not isinstance(node, int):
+            raise UserError(f"control point {node!r}: give whole numbers, or one boolean for each control point")
+        if not 0 <= node < count:
+            raise UserError(f"control point {node}: there are {count}, from 0 on")
+    return tuple(sorted(set(given)))

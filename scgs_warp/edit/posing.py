@@ -14,6 +14,7 @@ from ..types import Gaussians
 from . import edit_file, skeleton_file
 from .document import Edit
 from .engine import Engine
+from .graph import chosen_nodes
 from .handles import STAY, Handle, Target
 from .part_pose import JointFrame, PartMove, Rigid
 from .reach import Link, reach
@@ -115,7 +116,7 @@ class Posing:
     def split_part(self, name: str, nodes: Iterable[int], new: str | None = None) -> str:
         """Make some control points of a part a part of their own, which hangs on it; return its name."""
         start = self.engine.to_world(self.engine.motion_at(0.0).positions)
-        skeleton = self.skeleton.split(name, nodes, start, self.engine.graph.edges, new)
+        skeleton = self.skeleton.split(name, chosen_nodes(nodes, len(start)), start, self.engine.graph.edges, new)
         self._restructure(skeleton, {})
         return skeleton.parts[-1].name
 

@@ -24,7 +24,7 @@ from . import edit_file
 from .document import Edit
 from .engine import Engine
 from .field_reader import FieldReader
-from .graph import ControlGraph
+from .graph import ControlGraph, chosen_nodes
 from .handles import STAY, Handle, Target
 from .keyframes import Easing, Keyframe
 from .pose import NodePose
@@ -156,12 +156,7 @@ class EditSession(Posing):
         return viewmat[:3, :3].T @ (float(image.depth[row, column]) * ray - viewmat[:3, 3])
 
     def _nodes(self, nodes: Iterable[int]) -> tuple[int, ...]:
-        chosen = tuple(sorted({int(node) for node in nodes}))
-        if chosen and not (chosen[0] >= 0 and chosen[-1] < len(self)):
-            raise UserError(
-                f"control point {chosen[0] if chosen[0] < 0 else chosen[-1]}: there are {len(self)}, from 0 on"
-            )
-        return chosen
+        return chosen_nodes(nodes, len(self))
 
     # Handles and pins
 
