@@ -14,6 +14,7 @@ from ..types import Gaussians
 from . import edit_file, skeleton_file
 from .document import Edit
 from .engine import Engine
+from .field_reader import FieldReader
 from .graph import chosen_nodes
 from .handles import STAY, Handle, Target
 from .part_pose import JointFrame, PartMove, Rigid
@@ -381,6 +382,7 @@ class Posing:
 def _with_handle(edit: Edit, skeleton: Skeleton, part: str, time: float) -> tuple[Edit, Handle]:
     """Return the edit with a handle for a part, and that handle; the same edit if it has one."""
     nodes = skeleton.part(part).nodes
+    FieldReader({"time": float(time)}, f"part {part!r}").number("time", None, 0.0, 1.0)
     for handle in edit.handles:
         if handle.part == part:
             return edit, handle

@@ -11,7 +11,7 @@ from typing import Literal
 import numpy as np
 
 from ..errors import UserError
-from .field_reader import FieldReader
+from .field_reader import FieldReader, plain_values
 from .handles import Vector3
 
 Source = Literal["motion", "geometry", "edited"]
@@ -185,7 +185,8 @@ class Skeleton:
         Raises:
             UserError: there is no such part, or a number is wrong.
         """
-        fields = FieldReader({"joint": list(joint), "axis": None if axis is None else list(axis)}, f"part {name!r}")
+        given = {"joint": list(joint), "axis": None if axis is None else list(axis)}
+        fields = FieldReader(plain_values(given), f"part {name!r}")
         part = dataclasses.replace(self.part(name), joint=fields.vector("joint", 3), confidence=1.0)
         direction = fields.vector("axis", 3)
         if direction is not None:

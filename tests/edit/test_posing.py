@@ -336,3 +336,25 @@ def test_a_part_is_found_where_an_edit_has_put_it(session):
     assert session.part_at(point.tolist(), 0.0) == "elbow_left"
     with pytest.raises(UserError, match="3 finite numbers"):
         session.part_at((float("nan"), 0.0, 0.0), 0.0)
+
+
+@pytest.mark.parametrize("time", [float("nan"), 9, -0.1])
+def test_a_time_outside_the_motion_is_refused_also_for_a_part_that_is_posed(session, time):
+    session.turn("elbow_left", 20, (1, 0, 0))
+    before = session.edit
+    with pytest.raises(UserError, match="time is"):
+        session.turn("elbow_left", 20, (1, 0, 0), time)
+    with pytest.raises(UserError, match="time is"):
+        session.rotate("elbow_left", from_axis((1, 0, 0), 20).tolist(), time)
+    with pytest.raises(UserError, match="time is"):
+        session.pull("elbow_left", (0, 0, 0), time)
+    assert session.edit is before
+
+
+@pytest.mark.parametrize("kind", [list, tuple, np.asarray])
+def test_a_joint_takes_numbers_of_numpy(kind):
+    joint, axis = np.array([0.5, 1, 2], np.float32), np.array([0, 0, 2], np.float32)
+    skeleton = Skeleton((Part("a", (0,), None, (0.0, 0.0, 0.0)),))
+    moved = skeleton.with_joint("a", kind(joint), kind(axis)).part("a")
+    assert moved.joint == (0.5, 1.0, 2.0) and moved.axis == (0.0, 0.0, 1.0)
+    assert all(type(x) is float for x in moved.joint)
