@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Literal, get_args
 
 import cv2
 import numpy as np
@@ -207,10 +207,12 @@ class Painter:
         views: the film's (camera, time) pairs, of which some are rendered to determine the range of depths.
 
     Raises:
-        UserError: ``nodes`` is requested and the scene has no control points.
+        UserError: there is no such ``show``, or it is ``nodes`` and the scene has no control points.
     """
 
     def __init__(self, scene: Scene, show: Show, views: Sequence[tuple[Camera, float]]) -> None:
+        if show not in get_args(Show):
+            raise UserError(f"show {show!r}: choose one of {', '.join(get_args(Show))}")
         self._scene = scene
         self._show = show
         if show == "depth":

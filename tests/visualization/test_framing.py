@@ -9,9 +9,11 @@ import numpy as np
 import pytest
 import torch
 
+from helpers.edit_scenes import bar_scene
 from helpers.fake_scene import FakeScene
 from scgs_warp.errors import UserError
 from scgs_warp.geometry.cameras import Overview, orbit_camera, turntable
+from scgs_warp.visualization import films
 from scgs_warp.visualization.framing import aim, distance_to_fit, frame_subject, is_cut_out
 
 
@@ -75,3 +77,9 @@ def test_target_and_zoom():
     for target, zoom in ((None, 0.0), (None, math.inf), ((math.nan, 0.0, 0.0), 1.0)):
         with pytest.raises(UserError, match=r"--zoom|--target"):
             aim(FakeScene.overview, target, zoom)
+
+
+def test_a_film_of_something_unknown_is_refused(tmp_path):
+    with pytest.raises(UserError, match="show 'x': choose one of rgb, depth"):
+        films.turntable(bar_scene(), tmp_path / "film.gif", frames=2, size=16, show="x")  # pyright: ignore[reportArgumentType]
+    assert not list(tmp_path.iterdir())
