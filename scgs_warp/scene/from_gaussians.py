@@ -69,7 +69,9 @@ def _static_scene(
 def with_control_points(scene: Scene, nodes: int = COUNT) -> Scene:
     """Return a static scene with control points in place of its motion."""
     motion = StaticNodes.sample(scene.gaussians, nodes)
-    return Scene(
+    made = Scene(
         scene.gaussians, motion, scene.normalisation, scene.config, scene.overview, step=scene.step,
         settings=scene.settings,
     )  # fmt: skip
+    made.folder = scene.folder
+    return made

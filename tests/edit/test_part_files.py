@@ -11,6 +11,7 @@ import pytest
 from helpers.edit_scenes import bar_scene
 from scgs_warp.edit import EditSession, skeleton_file
 from scgs_warp.errors import UserError
+from scgs_warp.scene.from_gaussians import with_control_points
 
 
 def test_an_edit_of_parts_is_read_as_it_was_written(session, tmp_path):
@@ -109,3 +110,12 @@ def test_a_folder_that_cannot_be_written_is_read_only(tmp_path):
     scene = bar_scene()
     scene.folder = tmp_path / "missing"
     assert len(EditSession(scene).skeleton.parts) >= 2
+
+
+def test_a_still_run_keeps_its_skeleton(tmp_path):
+    still = bar_scene()
+    still.folder = tmp_path
+    session = EditSession(with_control_points(still, 40))
+    session.rename_part(session.skeleton.names[0], "left half")
+    assert session.save_skeleton() == tmp_path / "skeleton.json"
+    assert EditSession(with_control_points(still, 40)).skeleton == session.skeleton
