@@ -167,6 +167,8 @@ class EditSession(Posing):
         Raises:
             UserError: there is no node, a node does not exist, or a field is out of range.
         """
+        if fields.get("part") is not None:
+            raise UserError(f"a handle of part {fields['part']!r}: take pose_part, which gives it the part's skeleton")
         chosen = self._nodes(nodes)
         if not chosen:
             raise UserError("a handle needs at least one control point; choose some first")

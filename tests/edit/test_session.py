@@ -342,3 +342,9 @@ def test_control_points_are_whole_numbers_or_a_mask_of_all():
     with pytest.raises(UserError, match="control point"):
         session.split_part(session.skeleton.names[0], "12")
     assert not session.edit.handles
+
+
+def test_a_handle_of_a_part_is_left_to_pose_part(session):
+    with pytest.raises(UserError, match="pose_part"):
+        session.add_handle([0, 1], 0.0, part=session.skeleton.names[0])
+    assert session.edit == Edit()
