@@ -194,6 +194,11 @@ def _region(region: FieldReader, engine: Engine, time: float) -> tuple[int, ...]
     rings = region.integer("rings", 0, 0, 1000)
     radius = region.number("radius", None, 0.0)
     region.done()
+    given = [name for name in ("point", "sphere", "box") if name in region]
+    if len(given) > 1:
+        raise region.wrong(given[1], f"stands beside {given[0]}", "name one place: point, sphere or box")
+    if radius is not None and sphere is None:
+        raise region.wrong("radius", "belongs to sphere", "give both, or leave radius out")
     if point is not None:
         chosen = [int(np.linalg.norm(points - point, axis=1).argmin())]
     elif sphere is not None and radius is not None:
@@ -317,7 +322,7 @@ def _hold(fields: FieldReader, engine: Engine) -> Hold:
 def _exaggerate(fields: FieldReader | None, engine: Engine) -> Exaggerate | None:
     if fields is None:
         return None
-    nodes = _nodes(fields, "nodes", engine) if fields.raw("nodes") else ()
+    nodes = () if fields.raw("nodes") in (None, []) else _nodes(fields, "nodes", engine)
     exaggerate = Exaggerate(fields.number("factor", 1.5, -10.0, 10.0), fields.number("about", None, 0.0, 1.0), nodes)
     fields.done("comment")
     return exaggerate

@@ -214,3 +214,23 @@ def test_version_2_leaves_the_rotation_to_the_solver(session):
     explicit = parse({**content, "version": 2, "handles": [{**content["handles"][0], "turns": True}]}, "edit",
                      session.engine)  # fmt: skip
     assert explicit == old
+
+
+@pytest.mark.parametrize(
+    ("region", "words"),
+    [
+        ({"point": [0, 0, 0], "radius": 1}, "radius belongs to sphere"),
+        ({"point": [0, 0, 0], "box": [[0, 0, 0], [1, 1, 1]]}, "box stands beside point"),
+        ({"sphere": [0, 0, 0], "box": [[-9, -9, -9], [9, 9, 9]]}, "box stands beside sphere"),
+        ({"point": [0, 0, 0], "sphere": [0, 0, 0], "radius": 1}, "sphere stands beside point"),
+    ],
+)
+def test_a_region_of_several_kinds_is_refused(session, region, words):
+    with pytest.raises(UserError, match=words.replace(" ", ".*")):
+        parse(changed("handles.0.nodes", region), "x.json", session.engine)
+
+
+@pytest.mark.parametrize("nodes", [0, "", False, {}])
+def test_exaggeration_of_no_list_of_control_points_is_refused(session, nodes):
+    with pytest.raises(UserError, match=r"exaggerate\.nodes"):
+        parse(changed("exaggerate.nodes", nodes), "x.json", session.engine)
