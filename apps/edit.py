@@ -45,12 +45,13 @@ class Options:
     """Name of the animation of --motion; the first one by default."""
     match: Path | None = None
     """JSON object that names, for parts of the scene, those of --motion; by default those of the same name."""
-    nodes: int = 512
-    """Number of control points to make for a scene without motion."""
+    nodes: int | None = None
+    """Number of control points to make for a scene without motion; 512 by default."""
     size: int | None = None
     """Longer side of the film in pixels, instead of the script's."""
-    port: int = 8080
-    """Port of the editor on 127.0.0.1; if it is taken, the next free one. With --share, the port for other machines."""
+    port: int | None = None
+    """Port of the editor on 127.0.0.1, 8080 by default; if it is taken, the next free one. With --share, the port for
+    other machines."""
     share: bool = False
     """Serve the editor to other machines, too: on all interfaces, to whoever has the token of the printed address."""
     folder: Path | None = None
@@ -82,7 +83,7 @@ def check(options: Options) -> None:
         raise UserError("edit.py: give one of --run and --ply")
     if options.up is not None and options.ply is None:
         raise UserError(f"--up {options.up}: belongs to --ply; a run knows from its cameras what is up")
-    if not 1 <= options.nodes <= MAX_COUNT:
+    if options.nodes is not None and not 1 <= options.nodes <= MAX_COUNT:
         raise UserError(f"--nodes {options.nodes}: give 1 to {MAX_COUNT}")
     if options.parts is not None and not 1 <= options.parts <= MAX_COUNT:
         raise UserError(f"--parts {options.parts}: give 1 to {MAX_COUNT}")
@@ -102,35 +103,67 @@ def check(options: Options) -> None:
     kinds = {SUFFIXES[kind]: kind for kind in STILL_FORMATS}
     if options.export is not None and output_suffix(options.export) not in kinds:
         raise UserError(f"--export {options.export}: end the name in .ply, .compressed.ply, .splat, .spz, .sog or .glb")
-    if not 0 <= options.port <= 65535:
+    if options.port is not None and not 0 <= options.port <= 65535:
         raise UserError(f"--port {options.port}: give 1 to 65535, or 0 for any")
     if options.at is not None and not 0 <= options.at <= 3600:
         raise UserError(f"--at {options.at:g}: give a second of the film, from 0 to 3600")
+    check_unused(options)
     if options.output is not None:
         video.check_path(options.output)
     if options.export is not None:
         check_output(options.export, kinds[output_suffix(options.export)], "--export")
 
 
+def check_unused(options: Options) -> None:
+    """Refuse options that would have no effect.
+
+    Raises:
+        UserError: names the option, and the one that it does not go with or needs.
+    """
+    from scgs_warp.errors import UserError
+
+    if options.at is not None and options.export is None:
+        raise UserError(f"--at {options.at:g}: belongs to --export; give both, or neither")
+    ends = next((name for name in ("output", "export", "skeleton") if getattr(options, name)), None)
+    if ends is None:
+        return
+    for name in ("port", "share", "new", "folder"):
+        if getattr(options, name) not in (None, False):
+            raise UserError(f"--{name}: belongs to the editor in the browser; leave it or --{ends} out")
+    if options.size is not None and options.output is None:
+        raise UserError(f"--size {options.size}: belongs to a film; leave it out, or give --output beside --{ends}")
+
+
 def open_session(options: Options, device: str) -> EditSession:
     """Open the scene for editing, and load the script if there is one."""
     from scgs_warp.edit import EditSession
+    from scgs_warp.errors import UserError
     from scgs_warp.motion import Static
+    from scgs_warp.motion.static_nodes import COUNT
     from scgs_warp.scene.from_gaussians import open_gaussians, with_control_points
     from scgs_warp.scene.scene import Scene
 
     if options.ply is not None:
-        scene = open_gaussians(options.ply, device, options.nodes, options.up)
+        scene = open_gaussians(options.ply, device, options.nodes or COUNT, options.up)
     else:
         assert options.run is not None
         scene = Scene.load(options.run, device=device)
         if isinstance(scene.motion, Static):
-            scene = with_control_points(scene, options.nodes)
+            scene = with_control_points(scene, options.nodes or COUNT)
+        elif options.nodes is not None:
+            raise UserError(f"--nodes {options.nodes}: --run {options.run} moves and has its own; leave --nodes out")
     session = EditSession(scene)
     if options.parts is not None:
         session.use_parts(options.parts)
     if options.script is not None:
         session.load(options.script)
+        own = session.edit.skeleton
+        if options.parts is not None and own is None:
+            session.use_parts(options.parts)
+        elif options.parts is not None and own is not None and own.parts != session.parts(options.parts):
+            raise UserError(
+                f"--parts {options.parts}: --script {options.script} holds its own parts; leave --parts out"
+            )
         warn_of_another_scene(options.script, session)
     if options.motion is not None:
         play_motion(session, options, device)
@@ -187,7 +220,7 @@ def open_browser(session: EditSession, options: Options) -> None:
         session.resize_film(options.size)
         autosave.note(session.edit)
     title = source.resolve().name
-    served = {"port": options.port, "shared": options.share, "source": source}
+    served = {"port": 8080 if options.port is None else options.port, "shared": options.share, "source": source}
     with stop_signals() as stop:  # Shells may make background processes ignore Ctrl-C.
         editor = Editor(session, folder, title=title, **served, autosave=autosave)
         try:
@@ -246,15 +279,13 @@ def main(args: list[str] | None) -> None:
         camera = film_camera(session, 0.0)
         print(f"{options.output}: {frames} frames of {camera.width} x {camera.height}")
     if options.export is not None:
-        from scgs_warp.export.run import write_still
-        from scgs_warp.export.skeleton import keep_finite
+        from scgs_warp.export.run import write_edited
 
         last = max((frame.at for frame in session.edit.keyframes), default=0.0)
         at = last if options.at is None else options.at
         which = ", the last keyframe" if options.at is None and session.edit.keyframes else ""
-        scene, gaussians = session.scene, keep_finite(session.gaussians_at(session.scene_time(at), at))
-        write_still(options.export, gaussians, up=scene.overview.up, antialiased=scene.config.antialiased)
-        print(f"{options.export}: {len(gaussians.means):,} Gaussians, {at:g} s into the film{which}")
+        held, note = write_edited(options.export, session, at)
+        print(f"{options.export}: {held:,} Gaussians, {at:g} s into the film{which}{note}")
 
 
 def cli(args: list[str] | None = None) -> int:

@@ -127,8 +127,23 @@ def _export_still(request: ExportRequest, device: str) -> str:
     gaussians = keep_finite(gaussians)
     version = request.spz_version or 4
     clipped = write_still(request.output, gaussians, up=up, antialiased=antialiased, spz_version=version)
-    note = f" ({clipped:,} values clipped to what {output_suffix(request.output)} can hold)" if clipped else ""
-    return f"{len(gaussians.means):,} Gaussians {when}{note}"
+    return f"{len(gaussians.means):,} Gaussians {when}{_clipping(request.output, clipped)}"
+
+
+def write_edited(path: Path, session: EditSession, at: float) -> tuple[int, str]:
+    """Write a moment of an edit's film, fitting Gaussians in place of sharp ones, as :func:`export` does with ``--at``.
+
+    Returns:
+        Number of Gaussians, and a note on clipped values.
+    """
+    scene = plain_scene(session.scene)
+    gaussians = keep_finite(session.drawn_with(scene).gaussians_at(session.scene_time(at), at))
+    clipped = write_still(path, gaussians, up=scene.overview.up, antialiased=scene.config.antialiased)
+    return len(gaussians.means), _clipping(path, clipped)
+
+
+def _clipping(path: Path, clipped: int) -> str:
+    return f" ({clipped:,} values clipped to what {output_suffix(path)} can hold)" if clipped else ""
 
 
 def write_still(

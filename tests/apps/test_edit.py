@@ -40,7 +40,7 @@ def test_the_app_films_and_exports(tmp_path, ply, capsys):
     moved = (read_gaussian_ply(export).means - read_gaussian_ply(ply).means).norm(dim=1)
     assert float(moved.max()) == pytest.approx(1.0, abs=0.2)
     for name in ("out.sog", "loose/meta.json", "out.compressed.ply", "out.spz"):
-        assert app.cli([*arguments, "--export", str(tmp_path / name), "--at", "0.5"]) == 0
+        assert app.cli([*arguments[:-2], "--export", str(tmp_path / name), "--at", "0.5"]) == 0
         assert "300 Gaussians, 0.5 s into the film" in capsys.readouterr().out
         found = read_gaussians(tmp_path / name).means
         assert float(torch.cdist(read_gaussian_ply(export).means, found).min(dim=1).values.max()) < 0.01
@@ -76,6 +76,12 @@ def test_a_folder_that_cannot_be_made_is_refused_before_the_scene_is_loaded(tmp_
         (["--run", "a", "--size", "5"], "--size 5"),
         (["--run", "a", "--at", "-1"], "--at -1"),
         (["--run", "a", "--parts", "0"], "--parts 0"),
+        (["--run", "a", "--at", "1"], "--at 1: belongs to --export"),
+        (["--run", "a", "--export", "x.ply", "--size", "64"], "--size 64: belongs to a film"),
+        (["--run", "a", "--export", "x.ply", "--port", "8080"], "--port: belongs to the editor"),
+        (["--run", "a", "--script", "x", "--output", "x.mp4", "--share"], "leave it or --output out"),
+        (["--run", "a", "--skeleton", "--new"], "leave it or --skeleton out"),
+        (["--run", "a", "--skeleton", "--folder", "b"], "--folder: belongs to the editor"),
         (["--run", "a", "--skeleton", "--export", "out.ply"], "--skeleton prints and ends"),
     ],
 )
@@ -112,6 +118,33 @@ def test_a_wrong_script_stops_the_app(ply, tmp_path, capsys):
     assert app.cli(arguments) == 2
     assert "film.fps" in capsys.readouterr().err and not (tmp_path / "film.mp4").exists()
     assert open_gaussians(ply).gaussian_count == 300
+
+
+def test_control_points_and_parts_that_would_be_ignored_are_refused(ply, tmp_path, monkeypatch, capsys):
+    with monkeypatch.context() as patch:
+        patch.setattr("scgs_warp.scene.scene.Scene.load", lambda *_, **__: bar_scene())
+        assert app.cli(["--run", "a", "--nodes", "40", "--skeleton"]) == 2
+        error = capsys.readouterr().err
+        assert "--nodes 40" in error and "--run a" in error and error.count("\n") == 1
+    session = EditSession(open_gaussians(ply, "cpu", 40))
+    session.rename_part(session.skeleton.names[0], "trunk")
+    session.save(tmp_path / "edit.json")
+    command = ["--ply", str(ply), "--nodes", "40", "--skeleton", "--script", str(tmp_path / "edit.json")]
+    assert app.cli([*command, "--parts", "2"]) == 2
+    error = capsys.readouterr().err
+    assert "--parts 2: --script" in error and error.count("\n") == 1
+    (tmp_path / "edit.json").write_text(json.dumps({k: SCRIPT[k] for k in ("format", "version", "film")}))
+    assert app.cli([*command, "--parts", "2"]) == 0
+    assert len(capsys.readouterr().out.strip().splitlines()) in (3, 4), "a script without parts takes those asked for"
+
+
+def test_an_export_fits_sharp_gaussians(tmp_path, monkeypatch):
+    fitted = []
+    monkeypatch.setattr("scgs_warp.export.run.plain_scene", lambda scene: fitted.append(scene) or scene)
+    session = EditSession(bar_scene())
+    monkeypatch.setattr(app, "open_session", lambda options, device: session)
+    assert app.cli(["--run", "a", "--export", str(tmp_path / "x.ply")]) == 0
+    assert fitted == [session.scene]
 
 
 @pytest.fixture
