@@ -75,7 +75,7 @@ def check(options: Options) -> None:
         UserError: names the option and the remedy.
     """
     from scgs_warp.errors import UserError
-    from scgs_warp.export.request import STILL_FORMATS, SUFFIXES, check_output, output_suffix
+    from scgs_warp.export.request import STILL_FORMATS, SUFFIXES, Format, check_output, output_suffix
     from scgs_warp.motion.static_nodes import MAX_COUNT
     from scgs_warp.visualization import video
 
@@ -100,13 +100,15 @@ def check(options: Options) -> None:
         )
     if options.output is not None and options.script is None and options.motion is None:
         raise UserError(f"--output {options.output}: a film needs --script or --motion")
-    kinds = {SUFFIXES[kind]: kind for kind in STILL_FORMATS}
+    kinds: dict[str, Format] = {SUFFIXES[kind]: kind for kind in STILL_FORMATS}
     if options.export is not None and output_suffix(options.export) not in kinds:
         raise UserError(f"--export {options.export}: end the name in .ply, .compressed.ply, .splat, .spz, .sog or .glb")
     if options.port is not None and not 0 <= options.port <= 65535:
         raise UserError(f"--port {options.port}: give 1 to 65535, or 0 for any")
     if options.at is not None and not 0 <= options.at <= 3600:
         raise UserError(f"--at {options.at:g}: give a second of the film, from 0 to 3600")
+    if options.motion is not None and not options.motion.exists():
+        raise UserError(f"--motion {options.motion}: no such file or folder; give a run, a .glb or a .gltf")
     check_unused(options)
     if options.output is not None:
         video.check_path(options.output)

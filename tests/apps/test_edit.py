@@ -76,6 +76,7 @@ def test_a_folder_that_cannot_be_made_is_refused_before_the_scene_is_loaded(tmp_
         (["--run", "a", "--size", "5"], "--size 5"),
         (["--run", "a", "--at", "-1"], "--at -1"),
         (["--run", "a", "--parts", "0"], "--parts 0"),
+        (["--run", "a", "--motion", "nope"], "--motion nope: no such file or folder"),
         (["--run", "a", "--at", "1"], "--at 1: belongs to --export"),
         (["--run", "a", "--export", "x.ply", "--size", "64"], "--size 64: belongs to a film"),
         (["--run", "a", "--export", "x.ply", "--port", "8080"], "--port: belongs to the editor"),
