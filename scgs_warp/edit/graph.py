@@ -188,7 +188,7 @@ def chosen_nodes(nodes: Iterable[Any], count: int) -> tuple[int, ...]:
     Raises:
         UserError: one is no whole number or does not exist, or the booleans are not as many as the control points.
     """
-    given = nodes.tolist() if isinstance(nodes, np.ndarray | Tensor) else list(nodes)
+    given: list[Any] = nodes.tolist() if isinstance(nodes, np.ndarray | Tensor) else list(nodes)
     given = [node.item() if isinstance(node, np.generic | Tensor) else node for node in given]
     if given and all(isinstance(node, bool) for node in given):
         if len(given) != count:

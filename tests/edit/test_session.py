@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -332,15 +333,17 @@ def test_control_points_are_whole_numbers_or_a_mask_of_all():
     session = EditSession(bar_scene())
     mask = np.zeros(len(session), bool)
     mask[[3, 5]] = True
-    for nodes in ([5, 3], mask, mask.tolist(), torch.from_numpy(mask), np.array([3, 5], np.int32), {3, 5}):
+    takes: list[Any] = [[5, 3], mask, mask.tolist(), torch.from_numpy(mask), np.array([3, 5], np.int32), {3, 5}]
+    for nodes in takes:
         assert session.ring(nodes, 0) == (3, 5)
     session.pin(mask)
     assert session.edit.pins == (3, 5)
-    for wrong in ([3.7], "12", [True, 1], mask[:-1], np.array([1.0]), [None], [len(session)], [-1]):
+    refused: list[Any] = [[3.7], "12", [True, 1], mask[:-1], np.array([1.0]), [None], [len(session)], [-1]]
+    for wrong in refused:
         with pytest.raises(UserError, match="control point"):
             session.add_handle(wrong, 0.0)
     with pytest.raises(UserError, match="control point"):
-        session.split_part(session.skeleton.names[0], "12")
+        session.split_part(session.skeleton.names[0], refused[0])
     assert not session.edit.handles
 
 
