@@ -7,8 +7,7 @@ COLMAP's own CPU matcher uses search trees and lacks this property.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -17,8 +16,7 @@ import cv2
 import numpy as np
 import torch
 
-from ..errors import UserError
-from ..runtime.pycolmap_import import import_pycolmap
+from .colmap import damaged, database_errors, is_database, opened, quiet, remove_database
 from .source import read_rgb
 
 Tensor = torch.Tensor
@@ -54,37 +52,23 @@ class FrameFiles(NamedTuple):
     """Folder of masks with the same names, black on moving pixels; None without masks."""
 
 
-@contextmanager
-def quiet() -> Iterator[Any]:
-    """Provide pycolmap, with its log silenced for the duration of the context.
-
-    Raises:
-        UserError: pycolmap is too old.
-    """
-    pycolmap = import_pycolmap()
-    if not hasattr(pycolmap, "FeatureExtractor"):
-        raise UserError(f"pycolmap {pycolmap.__version__} is too old for capture; pip install 'pycolmap>=4.1'")
-    before = pycolmap.logging.minloglevel
-    pycolmap.logging.minloglevel = int(pycolmap.logging.Level.FATAL)
-    try:
-        yield pycolmap
-    finally:
-        pycolmap.logging.minloglevel = before
-
-
 def begin(
     database: Path, frame_files: FrameFiles, model: CameraModel, focal: float | None, shared: bool = True
 ) -> None:
-    """Make the database of the frames, unless it exists.
+    """Make the database of the frames, unless it exists and holds all of them.
 
     Args:
         focal: focal length in pixels; None if unknown.
         shared: all frames have one camera; otherwise each has its own.
+
+    Raises:
+        UserError: the database cannot be written.
     """
-    with quiet() as pycolmap:
-        with pycolmap.Database.open(database) as storage:
-            if storage.num_images():
-                return
+    if _is_complete(database, len(frame_files.names)):
+        return
+    remove_database(database)  # An interrupted import left some of the frames.
+    with quiet() as pycolmap, database_errors(database):
+        pycolmap.Database.open(database).close()
         options = pycolmap.ImageReaderOptions(camera_model=model, default_focal_length_factor=INITIAL_FOCAL)
         if focal is not None:
             height, width = read_rgb(frame_files.folder / frame_files.names[0]).shape[:2]
@@ -99,19 +83,29 @@ def begin(
         )
 
 
+def _is_complete(database: Path, count: int) -> bool:
+    """Return whether the database holds ``count`` frames."""
+    if not database.is_file() or not is_database(database):
+        return False
+    with opened(database) as (_, storage):
+        return storage.num_images() == storage.num_frames() == count
+
+
 def extract(database: Path, frame_files: FrameFiles, most: int, done: Callable[[], object]) -> None:
     """Extract features of every frame that has none yet, except on masked pixels.
 
     Args:
         most: largest number of features per frame.
         done: called after each frame.
+
+    Raises:
+        UserError: the database is damaged, or cannot be written.
     """
-    with quiet() as pycolmap, pycolmap.Database.open(database) as storage:
+    with opened(database) as (pycolmap, storage):
         options = pycolmap.FeatureExtractionOptions(num_threads=1, use_gpu=False)
         options.sift.max_num_features = most
         extractor = pycolmap.FeatureExtractor.create(options, pycolmap.Device.cpu)
-        for name in frame_files.names:
-            image = storage.read_image_with_name(name).image_id
+        for name, image in zip(frame_files.names, _numbers(database, storage, frame_files)):
             if not storage.exists_keypoints(image):
                 gray = cv2.cvtColor(read_rgb(frame_files.folder / name), cv2.COLOR_RGB2GRAY)
                 keypoints, descriptors = extractor.extract_from_uint8_array(gray)
@@ -119,9 +113,18 @@ def extract(database: Path, frame_files: FrameFiles, most: int, done: Callable[[
                 if frame_files.masks is not None and len(rows):
                     kept = ~_masked(frame_files.masks / name, rows[:, :2])
                     rows, descriptors.data = rows[kept], descriptors.data[kept]
-                storage.write_descriptors(image, descriptors)
+                if not storage.exists_descriptors(image):  # An interruption may have come between the two.
+                    storage.write_descriptors(image, descriptors)
                 storage.write_keypoints(image, rows)
             done()
+
+
+def _numbers(database: Path, storage: Any, frame_files: FrameFiles) -> list[int]:
+    """Return COLMAP's numbers of the frames; raise UserError if one is missing."""
+    images = [storage.read_image_with_name(name) for name in frame_files.names]
+    if any(image is None for image in images):
+        raise damaged(database)
+    return [image.image_id for image in images]
 
 
 def _masked(file: Path, pixels: np.ndarray) -> np.ndarray:
@@ -159,21 +162,24 @@ def match(
         chosen: pairs of frame numbers, ascending.
         device: device of the comparison of descriptors.
         done: called after each pair.
+
+    Raises:
+        UserError: the database is damaged, or cannot be written.
     """
     kept: dict[int, Tensor] = {}
-    with quiet() as pycolmap, pycolmap.Database.open(database) as storage:
+    with opened(database) as (pycolmap, storage):
         options = pycolmap.TwoViewGeometryOptions()
         options.ransac.random_seed = seed
-        images = [storage.read_image_with_name(name) for name in frame_files.names]
-        points = [storage.read_keypoints(image.image_id)[:, :2].astype(np.float64) for image in images]
-        cameras = [storage.read_camera(image.camera_id) for image in images]
+        images = _numbers(database, storage, frame_files)
+        points = [storage.read_keypoints(image)[:, :2].astype(np.float64) for image in images]
+        cameras = [storage.read_camera(storage.read_image(image).camera_id) for image in images]
         for a, b in chosen:
-            one, two = images[a].image_id, images[b].image_id
+            one, two = images[a], images[b]
             if not storage.exists_two_view_geometry(one, two):
                 kept = {k: v for k, v in kept.items() if k >= a}  # Ascending pairs never return to earlier frames.
                 for k in (a, b):
                     if k not in kept:
-                        kept[k] = torch.from_numpy(storage.read_descriptors(images[k].image_id).data.copy()).to(device)
+                        kept[k] = torch.from_numpy(storage.read_descriptors(images[k]).data.copy()).to(device)
                 matches = nearest_mutual(kept[a], kept[b])
                 if not storage.exists_matches(one, two):
                     storage.write_matches(one, two, matches)
@@ -186,7 +192,7 @@ def match(
 
 def forget(database: Path) -> None:
     """Remove all matches but keep the features."""
-    with quiet() as pycolmap, pycolmap.Database.open(database) as storage:
+    with opened(database) as (_, storage):
         storage.clear_matches()
         storage.clear_two_view_geometries()
 
@@ -232,8 +238,8 @@ class Links(NamedTuple):
 
 def links(database: Path, frame_files: FrameFiles) -> Links:
     """Compute the statistics of the database."""
-    with quiet() as pycolmap, pycolmap.Database.open(database) as storage:
-        images = [storage.read_image_with_name(name).image_id for name in frame_files.names]
+    with opened(database) as (pycolmap, storage):
+        images = _numbers(database, storage, frame_files)
         features = [storage.num_keypoints_for_image(image) for image in images]
         geometries = [
             storage.read_two_view_geometry(a, b) if storage.exists_two_view_geometry(a, b) else None

@@ -9,7 +9,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .features import FrameFiles, quiet
+from .colmap import quiet
+from .features import FrameFiles
 
 MIN_VIEWS = 3
 """Smallest number of frames in which a point must be seen."""

@@ -18,6 +18,7 @@ from ..runtime.progress import progress
 from ..storage.json_files import as_number
 from ..visualization.video import write_png
 from . import features, mapping, moving, picking, pictures, writing
+from .colmap import remove_database
 from .diagnosis import Outcome, notes, too_few
 from .features import CameraModel, FrameFiles, Matching
 from .journal import Journal
@@ -293,7 +294,7 @@ def _solve(
             return mapping.solve(database, frame_files, model, request.seed, lambda: bar.done < count and bar.advance())
 
     settings = [request.camera_model, request.fov, request.features]
-    journal.stage("features", settings, find, lambda: database.unlink(missing_ok=True))
+    journal.stage("features", settings, find, lambda: remove_database(database))
     journal.stage("matches", [request.matching, request.seed], compare, lambda: features.forget(database))
     journal.stage("cameras", request.seed, solve_cameras, lambda: shutil.rmtree(model, ignore_errors=True))
     solved = mapping.read_solution(model, frame_files)

@@ -15,7 +15,8 @@ from ..data.points import write_points
 from ..data.readers.transforms import OPENGL_TO_OPENCV
 from ..storage.files import write_atomically
 from ..visualization.video import write_png
-from .features import FrameFiles, quiet
+from .colmap import quiet
+from .features import FrameFiles
 from .mapping import CameraSolution
 from .similarity import upright
 from .source import read_rgb

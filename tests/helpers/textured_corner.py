@@ -7,7 +7,8 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from scgs_warp.capture.features import FrameFiles, quiet
+from scgs_warp.capture.colmap import quiet
+from scgs_warp.capture.features import FrameFiles
 from scgs_warp.capture.rig.cameras import RigCamera, straightened
 from scgs_warp.capture.rig.points import lens_of
 from scgs_warp.visualization.video import write_png

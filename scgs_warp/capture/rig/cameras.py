@@ -10,7 +10,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..features import FrameFiles, quiet
+from ..colmap import quiet
+from ..features import FrameFiles
 from ..mapping import MAX_ERROR
 
 MIN_VIEWS = 2

@@ -17,6 +17,7 @@ from ...runtime.progress import progress
 from ...storage.json_files import as_number
 from ...visualization.video import write_png
 from .. import features, pictures
+from ..colmap import remove_database
 from ..features import FrameFiles
 from ..journal import Journal
 from ..source import Video, read_rgb
@@ -245,7 +246,7 @@ class _Rig:
                 features.match(database, stills, chosen, request.seed, self.device, bar.advance)
 
         settings = [request.camera_model, request.fov, request.features, shared]
-        self.journal.stage("features", settings, find, lambda: database.unlink(missing_ok=True))
+        self.journal.stage("features", settings, find, lambda: remove_database(database))
         self.journal.stage("matches", request.seed, compare, lambda: features.forget(database))
         with self.show(1, "cameras") as bar:
             self.journal.stage(

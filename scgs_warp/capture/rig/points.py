@@ -10,7 +10,8 @@ import cv2
 import numpy as np
 import torch
 
-from ..features import nearest_mutual, quiet
+from ..colmap import quiet
+from ..features import nearest_mutual
 from .cameras import RigCamera, centre_of
 
 MAX_ERROR = 1.5

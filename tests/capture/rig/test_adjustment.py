@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from helpers import textured_corner as corner
-from scgs_warp.capture.features import quiet
+from scgs_warp.capture.colmap import quiet
 from scgs_warp.capture.rig import adjustment
 from scgs_warp.capture.rig.cameras import median_error, read_solution, solution_of
 from scgs_warp.geometry import stereo

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from scgs_warp.capture.features import quiet
+from scgs_warp.capture.colmap import quiet
 from scgs_warp.capture.rig.cameras import straightened
 
 FOCAL, WIDTH, HEIGHT = 1000.0, 1200, 1200
