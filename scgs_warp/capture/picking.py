@@ -19,12 +19,16 @@ FASTEST_SHARE = 0.05
 noticed."""
 NOISE_PIXELS = 0.15
 """Largest motion between two frames that is attributed to noise, in pixels at ``FLOW_SIDE``."""
+MIN_SECONDS = 1 / 31
+"""Smallest time between frames from which the next frame's motion is measured. Between the frames of a film of 240
+frames per second, even a fast motion is within the noise. Time stamps of 30 frames per second are not exact."""
 MIN_MOTION = 1.0
 """Motion since the previously picked frame below which a frame counts as a repetition, in pixels at ``FLOW_SIDE``."""
 MIN_SHARPNESS = 0.5
 """Sharpness relative to neighbouring frames below which a frame counts as blurred."""
 NEIGHBOURS = 12
-"""Number of frames on each side with which a frame's sharpness is compared; they show similar content."""
+"""Number of frames on each side with which a frame's sharpness is compared; they show similar content. In a film of
+many frames a second, they are about ``MIN_SECONDS`` apart."""
 NEIGHBOURS_QUANTILE = 0.75
 """Quantile of the neighbours' sharpness that serves as reference, high enough to detect a series of blurred frames."""
 
@@ -38,8 +42,8 @@ class FrameMeasures(NamedTuple):
     """[F]"""
     sharpness: np.ndarray
     """[F] energy of fine detail, in squared grey levels"""
-    motion: np.ndarray
-    """[F] motion since the previous frame, pixels at ``FLOW_SIDE``; 0 for the first frame."""
+    moved: np.ndarray
+    """[F] motion since the first frame beyond noise, pixels at ``FLOW_SIDE``; never falls."""
 
 
 class Selection(NamedTuple):
@@ -61,16 +65,19 @@ def measure(stills: Iterable[SourceFrame], done: Callable[[], object] = lambda: 
         done: called after each frame.
     """
     flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST)
-    rows, before = [], None
+    rows, before, since, moved = [], None, 0.0, 0.0
     for still in stills:
         gray = cv2.cvtColor(shrunk(still.image, SHARPNESS_SIDE), cv2.COLOR_RGB2GRAY)
         small = shrunk(gray, FLOW_SIDE)
         motion = 0.0 if before is None else fastest(flow.calc(before, small, None))  # type: ignore[call-overload]
-        rows.append((still.index, still.seconds, sharpness(gray), motion))
-        before = small
+        now = moved + max(motion - NOISE_PIXELS, 0.0)
+        rows.append((still.index, still.seconds, sharpness(gray), now))
+        if before is None or still.seconds - since >= MIN_SECONDS:
+            before, since, moved = small, still.seconds, now
         done()
     table = np.array(rows, np.float64).reshape(-1, 4)
-    return FrameMeasures(table[:, 0].astype(int), *table[:, 1:].T)
+    index, seconds, sharp, way = table.T
+    return FrameMeasures(index.astype(int), seconds, sharp, np.maximum.accumulate(way))
 
 
 def sharpness(gray: np.ndarray) -> float:
@@ -86,10 +93,12 @@ def fastest(flow: np.ndarray) -> float:
     return float(np.partition(lengths, len(lengths) - count)[-count:].mean())
 
 
-def relative_sharpness(sharp: np.ndarray) -> np.ndarray:
-    """Divide sharpness [F] by the reference sharpness of the neighbours; 1 where that is 0."""
-    padded = np.pad(sharp, NEIGHBOURS, "constant", constant_values=np.nan)
-    around = np.lib.stride_tricks.sliding_window_view(padded, 2 * NEIGHBOURS + 1)
+def relative_sharpness(sharp: np.ndarray, seconds: np.ndarray) -> np.ndarray:
+    """Divide sharpness [F] by the reference sharpness of the neighbours in time [F]; 1 where that is 0."""
+    interval = float(np.median(np.diff(seconds))) if len(seconds) > 1 else 1.0
+    step = max(1, round(MIN_SECONDS / max(interval, 1e-4)))
+    padded = np.pad(sharp, NEIGHBOURS * step, "constant", constant_values=np.nan)
+    around = np.lib.stride_tricks.sliding_window_view(padded, 2 * NEIGHBOURS * step + 1)[:, ::step]
     usual = np.nanquantile(around, NEIGHBOURS_QUANTILE, axis=1)
     return np.where(usual > 0, sharp / np.maximum(usual, 1e-12), 1.0)
 
@@ -102,9 +111,8 @@ def pick(measures: FrameMeasures, count: int) -> Selection:
     previously picked one. If there are as many segments as frames, only blurred and repeated frames are omitted.
     """
     frames = len(measures.index)
-    relative = relative_sharpness(measures.sharpness)
+    relative, moved = relative_sharpness(measures.sharpness, measures.seconds), measures.moved
     blurred = relative < MIN_SHARPNESS
-    moved = np.cumsum(np.maximum(measures.motion - NOISE_PIXELS, 0.0))
     if count >= frames:
         stretch = np.arange(frames)
     else:

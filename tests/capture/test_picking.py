@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import cv2
 import numpy as np
+import pytest
 
 from helpers.films import pan, wall
 from scgs_warp.capture import picking
 from scgs_warp.capture.source import SourceFrame
 
 
-def measured(frames: list[np.ndarray]) -> picking.FrameMeasures:
-    return picking.measure(SourceFrame(index, index / 30, frame, "") for index, frame in enumerate(frames))
+def measured(frames: list[np.ndarray], fps: float = 30) -> picking.FrameMeasures:
+    return picking.measure(SourceFrame(index, index / fps, frame, "") for index, frame in enumerate(frames))
 
 
 def blur(frame: np.ndarray) -> np.ndarray:
@@ -59,3 +62,38 @@ def test_picks_follow_time_and_motion():
     assert 34 <= len(picked) <= 40 and 8 <= resting <= 18
     assert max(np.diff(picked)) <= 16
     assert picked == picking.pick(measured(pan(shifts)), 40).places
+
+
+def slow_pan(fps: int) -> list[np.ndarray]:
+    """Three seconds at 33 pixels a second; two moments, a sixth of a second each, are blurred."""
+    background, frames = wall(height=120), []
+    for index in range(3 * fps):
+        shift = np.array([[1.0, 0.0, -33.0 * index / fps], [0.0, 1.0, 0.0]])
+        frame = cv2.warpAffine(background, shift, (160, 120), flags=cv2.INTER_CUBIC)
+        frames.append(blur(frame) if fps // 2 <= index < 2 * fps // 3 or 2 * fps <= index < 13 * fps // 6 else frame)
+    return frames
+
+
+@pytest.mark.parametrize("fps", [60, 120, 240])
+def test_a_film_of_many_frames_a_second_is_picked_as_one_of_thirty(fps):
+    """What moves slowly from frame to frame is no noise, and a series of blurred frames is one of many frames."""
+    few, many = measured(slow_pan(30)), measured(slow_pan(fps), fps)
+    assert np.array_equal(many.moved[:: fps // 30], few.moved) and (np.diff(many.moved) >= 0).all()
+    assert few.moved[-1] > 70
+    for count in (20, 45):
+        expected, found = picking.pick(few, count), picking.pick(many, count)
+        assert abs(len(found.places) - len(expected.places)) <= 1
+        assert found.blurred == pytest.approx(expected.blurred * fps / 30, abs=4)
+        times = [places.seconds[pick.places] for places, pick in ((few, expected), (many, found))]
+        assert max(np.abs(times[0] - second).min() for second in times[1]) < 3 / count
+
+
+@pytest.mark.parametrize("seconds", [1.0, 1 / 24, 0.033])
+def test_frames_far_enough_apart_are_each_compared_with_the_one_before(seconds):
+    frames = pan([0, 3, 3, 7, 8, 8, 20, 21])
+    flow = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_ULTRAFAST)
+    grays = [cv2.cvtColor(frame, cv2.COLOR_RGB2GRAY) for frame in frames]
+    flows = [flow.calc(*pair, None) for pair in pairwise(grays)]  # type: ignore[call-overload]
+    steps = [0.0, *(picking.fastest(each) for each in flows)]
+    expected = np.cumsum(np.maximum(np.array(steps) - picking.NOISE_PIXELS, 0.0))
+    assert np.array_equal(measured(frames, 1 / seconds).moved, expected)
