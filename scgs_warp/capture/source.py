@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Container, Iterator
+from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
@@ -13,11 +14,15 @@ import numpy as np
 from ..data.images import is_complete, oversized_claim, size_text
 from ..data.natural_order import natural
 from ..errors import UserError
+from .completeness import Incomplete, header_of, incomplete
+from .frame_times import REORDERED, rising
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
 DIGEST_BYTES = 1 << 20
 """Number of bytes at the beginning and at the end of a file that enter its digest; videos are too large to hash
 completely."""
+SAMPLE = 100
+"""Number of stored pictures that show whether they have times of display."""
 
 
 class SourceFrame(NamedTuple):
@@ -41,6 +46,8 @@ class Source(Protocol):
     """True for a video, whose frames are consecutive; images of a folder need not be."""
     count: int
     """Number of frames according to the file's header, which may be wrong."""
+    incomplete: Incomplete | None
+    """What is there of an incomplete film, once all frames have been read."""
 
     def frames(self, longest: int) -> Iterator[SourceFrame]:
         """Yield all frames in order; larger frames are reduced so that the longer side has ``longest`` pixels.
@@ -79,12 +86,15 @@ class Video:
             UserError: the file is not a video.
         """
         self.path = path
+        self.incomplete: Incomplete | None = None
         with self._opened() as container:
             stream = container.streams.video[0]
             rate = float(stream.average_rate or 30)
             seconds = float(container.duration or 0) / 1e6
             self.count = int(stream.frames) or max(1, round(seconds * rate))
             self.rate = rate
+            self._header = header_of(container, stream)
+            self._delay = REORDERED if _lacks_times(container, stream) else 0
 
     def _opened(self) -> Any:
         import av
@@ -104,37 +114,76 @@ class Video:
 
     def frames(self, longest: int, wanted: Container[int] | None = None) -> Iterator[SourceFrame]:
         """Yield all frames in order, or only the ``wanted`` ones by their index; the others are not converted."""
-        from av.error import FFmpegError
-
+        self.incomplete, read = None, _Read()
         with self._opened() as container:
             stream = container.streams.video[0]
             stream.thread_type = "AUTO"
             shape = float(stream.sample_aspect_ratio or 1)
-            first, index, size, last = None, 0, None, 0.0
-            for packet in container.demux(stream):
-                try:
-                    decoded = packet.decode()
-                except FFmpegError:  # Later packets may be intact.
-                    continue
-                for frame in decoded:
-                    seconds = float(frame.time) if frame.time is not None else index / self.rate
-                    first = seconds if first is None else first
-                    if wanted is None or index in wanted:
-                        size = size or (frame.width, frame.height)
-                        now = frame.width, frame.height
-                        if size != now:
-                            raise UserError(
-                                f"{self.path}: its pictures are {size_text(size)}, but {size_text(now)} from second "
-                                f"{seconds - first:.2f} on; give an --end before {last:.2f}, or save it in one size"
-                            )
-                        last = seconds - first
-                        yield SourceFrame(index, seconds - first, _picture(frame, longest, shape), "")
-                    index += 1
-        if index == 0:
+            size, last = None, 0.0
+            frames = rising(read.frames(container, stream), self.rate, self._delay)
+            for index, (frame, seconds) in enumerate(frames):
+                if wanted is None or index in wanted:
+                    size = size or (frame.width, frame.height)
+                    now = frame.width, frame.height
+                    if size != now:
+                        raise UserError(
+                            f"{self.path}: its pictures are {size_text(size)}, but {size_text(now)} from second "
+                            f"{seconds:.2f} on; give an --end before {last:.2f}, or save it in one size"
+                        )
+                    yield SourceFrame(index, seconds, _picture(frame, longest, shape), "")
+                last = seconds
+        if read.decoded == 0:
             raise UserError(f"{self.path}: no frame can be decoded; save it as .mp4, or give a folder of images")
+        self.incomplete = incomplete(
+            self._header, self.rate, decoded=read.decoded, hidden=read.hidden, seconds=last, latest=read.latest
+        )
+        if self.incomplete is not None and self.incomplete.useless:
+            raise UserError(f"{self.path}: only {self.incomplete.describe()}")
 
     def digest(self) -> str:
         return _digest([self.path])
+
+
+class _Read:
+    """Count of the pictures of a video that have been read."""
+
+    def __init__(self) -> None:
+        self.decoded = 0
+        self.hidden = 0
+        """Number of stored pictures that are not to be shown."""
+        self.latest = 0.0
+        """Largest time on the file's clock, seconds."""
+
+    def frames(self, container: Any, stream: Any) -> Iterator[tuple[Any, float | None]]:
+        """Yield all frames that can be decoded, with their times on the file's clock."""
+        from av.error import FFmpegError
+
+        for packet in container.demux(stream):
+            self.hidden += bool(packet.size and packet.is_discard)
+            try:
+                decoded = packet.decode()
+            except FFmpegError:  # Later packets may be intact.
+                continue
+            for frame in decoded:
+                seconds = None if frame.time is None else float(frame.time)
+                self.decoded += 1
+                self.latest = max(self.latest, seconds or 0.0)
+                yield frame, seconds
+
+
+def _lacks_times(container: Any, stream: Any) -> bool:
+    """Return whether the times of a video are those of decoding, although its order of display is another: they never
+    fall, as times of display would. H.264 in .avi is stored so."""
+    from av.error import FFmpegError
+
+    if stream.codec_context is None or not stream.codec_context.has_b_frames:  # None: an unknown codec
+        return False
+    try:
+        times = [packet.pts for packet in islice(container.demux(stream), SAMPLE)]
+    except FFmpegError:
+        return False
+    known = [time for time in times if time is not None]
+    return known == sorted(known)
 
 
 def _picture(frame: Any, longest: int, shape: float) -> np.ndarray:
@@ -158,6 +207,7 @@ class Folder:
     """A folder of images, in the natural order of their names."""
 
     video = False
+    incomplete: Incomplete | None = None
 
     def __init__(self, path: Path) -> None:
         """
@@ -221,7 +271,7 @@ def _digest(files: list[Path]) -> str:
         digest.update(f"{size},".encode())
         with file.open("rb") as content:
             digest.update(content.read(DIGEST_BYTES))
-            if size > 2 * DIGEST_BYTES:
-                content.seek(size - DIGEST_BYTES)
+            if size > DIGEST_BYTES:
+                content.seek(max(DIGEST_BYTES, size - DIGEST_BYTES))
                 digest.update(content.read(DIGEST_BYTES))
     return digest.hexdigest()

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+import hashlib
 from fractions import Fraction
 
 import numpy as np
 import pytest
 
-from helpers.films import mask_images, pan, stream
-from scgs_warp.capture.source import Video, open_source, rotate_image
+from helpers.films import encoded, mask_images, pan, stream
+from scgs_warp.capture.source import DIGEST_BYTES, Folder, Video, open_source, rotate_image
 from scgs_warp.errors import UserError
 from scgs_warp.visualization.video import film, write_png
 
@@ -73,3 +74,28 @@ def test_what_is_no_film_is_refused(tmp_path):
     (mixed / "010.png").write_bytes(b"x")
     with pytest.raises(UserError, match=r"010\.png: is not an image"):
         list(open_source(mixed).frames(64))
+
+
+def test_what_identifies_a_source_covers_whole_files_up_to_two_mebibytes(tmp_path):
+    """Larger files are identified by both ends; what was identified before stays so."""
+    file, whole = tmp_path / "1.png", 2 * DIGEST_BYTES
+    for size in (100, DIGEST_BYTES, DIGEST_BYTES + 1, whole, whole + 1):
+        content = bytearray(np.random.default_rng(0).bytes(size))
+        file.write_bytes(content)
+        first = Folder(tmp_path).digest()
+        seen = hashlib.sha256(f"{size},".encode() + content[:DIGEST_BYTES])
+        if size > whole:
+            seen.update(content[-DIGEST_BYTES:])
+        assert (first == seen.hexdigest()) == (size <= DIGEST_BYTES or size > whole)
+        content[-1] ^= 1
+        file.write_bytes(content)
+        assert Folder(tmp_path).digest() != first
+
+
+def test_a_codec_that_nobody_knows(tmp_path):
+    encoded(tmp_path / "film.mkv", 10)
+    content = (tmp_path / "film.mkv").read_bytes()
+    assert content.count(b"V_MPEG4/ISO/AVC") == 1
+    (tmp_path / "film.mkv").write_bytes(content.replace(b"V_MPEG4/ISO/AVC", b"V_UNHEARD/OF/XX"))
+    with pytest.raises(UserError, match=r"film\.mkv"):
+        list(Video(tmp_path / "film.mkv").frames(64))

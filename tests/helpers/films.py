@@ -60,3 +60,29 @@ def cut_film(path: Path, to: Path, count: int) -> None:
             if packet.size:
                 packet.pts, packet.dts, packet.stream = packet.pts - shift, packet.dts - shift, target
                 out.mux(packet)
+
+
+def encoded(path: Path, count: int, options: dict[str, str] | None = None, sound: float = 0.0) -> None:
+    """Write a film of H.264 with reordered frames, 25 a second, of a noisy pan over the wall.
+
+    Args:
+        options: of the container.
+        sound: length of a silent sound track, seconds; 0 for none.
+    """
+    import av
+
+    rng = np.random.default_rng(0)
+    with av.open(str(path), "w", options=options or {}) as out:
+        stream = out.add_stream("libx264", rate=25)
+        stream.width, stream.height, stream.pix_fmt = 160, 120, "yuv420p"
+        track = out.add_stream("aac", rate=48000) if sound else None
+        for picture in pan(range(0, 2 * count, 2)):
+            noisy = (picture + rng.integers(-9, 9, picture.shape)).clip(0, 255).astype(np.uint8)
+            out.mux(stream.encode(av.VideoFrame.from_ndarray(noisy, format="rgb24")))
+        out.mux(stream.encode())
+        if track is not None:
+            for index in range(int(sound * 48000 / 1024)):
+                silence = av.AudioFrame.from_ndarray(np.zeros((1, 1024), np.float32), format="fltp", layout="mono")
+                silence.sample_rate, silence.pts = 48000, 1024 * index
+                out.mux(track.encode(silence))
+            out.mux(track.encode())
