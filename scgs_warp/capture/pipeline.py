@@ -19,6 +19,7 @@ from ..storage.json_files import as_number
 from ..visualization.video import write_png
 from . import features, mapping, moving, picking, pictures, writing
 from .colmap import remove_database
+from .completeness import Incomplete
 from .diagnosis import Outcome, notes, too_few
 from .features import CameraModel, FrameFiles, Matching
 from .journal import Journal
@@ -79,6 +80,15 @@ class PickedFrames(NamedTuple):
     """Number of frames in the source."""
     blurred: int
     alike: int
+    decoded: int = 0
+    """Number of frames of an incomplete video that can be decoded."""
+    announced: int = 0
+    """Number of frames of an incomplete video according to its header; 0 if nothing is missing."""
+
+    @property
+    def incomplete(self) -> Incomplete | None:
+        """What is there of an incomplete video."""
+        return Incomplete(self.decoded, self.announced, self.span[1]) if self.announced else None
 
     @property
     def files(self) -> list[str]:
@@ -143,7 +153,7 @@ def capture(
     outcome, solved = _solve(request, source, frames, frame_files, journal, device, show)
     if request.keep != "all" or journal.knows("images"):  # Folders of earlier versions have no such stage.
         journal.stage("images", request.keep, dict, lambda: None)
-    lines = _lines(frames, outcome)
+    lines = _lines(request, frames, outcome)
     if not before:
         _draw_sheet(folder / SHEET, frames, frame_files, solved, source.video)
     if solved is None or outcome.registered < max(request.least * len(frames.indices), 3):
@@ -157,6 +167,8 @@ def _enough(request: CaptureRequest, frames: PickedFrames) -> None:
     if len(frames.indices) >= MIN_FRAMES:
         return
     if frames.seen < MIN_FRAMES:
+        if frames.incomplete is not None:
+            raise UserError(f"{request.source}: only {frames.incomplete.describe()}")
         raise UserError(f"{request.source}: {frames.seen} frames are too few; film a few seconds, or give more images")
     raise UserError(
         f"{request.source}: {len(frames.indices)} of {frames.seen} frames are neither blurred nor alike "
@@ -194,7 +206,8 @@ def _frames_of(stored: Any) -> PickedFrames | None:
     """Parse the picked frames from a journal; return None if the entry is malformed."""
     try:
         frames = PickedFrames(**{**stored, "span": tuple(stored["span"]), "size": tuple(stored["size"])})
-        counts = (*frames.indices, *frames.size, frames.seen, frames.blurred, frames.alike)
+        totals = (frames.seen, frames.blurred, frames.alike, frames.decoded, frames.announced)
+        counts = (*frames.indices, *frames.size, *totals)
         whole = all(isinstance(count, int) and 0 <= count < 2**31 for count in counts)
         numbers = [as_number(second) for second in (*frames.seconds, *frames.span)]
         times = all(number is not None and abs(number) <= MAX_SECONDS for number in numbers)
@@ -228,7 +241,8 @@ def _choose(request: CaptureRequest, source: Source, show: ShowProgress) -> Pick
     seconds = measures.seconds[picked.places].tolist()
     span = (float(measures.seconds[0]), float(measures.seconds[-1]))
     indices = measures.index[picked.places].tolist()
-    return PickedFrames(indices, seconds, [], span, (0, 0), len(measures.index), picked.blurred, picked.alike)
+    there = (0, 0) if source.incomplete is None else source.incomplete[:2]
+    return PickedFrames(indices, seconds, [], span, (0, 0), len(measures.index), picked.blurred, picked.alike, *there)
 
 
 def _shown(source: Source, bar: Any) -> Iterator[SourceFrame]:
@@ -312,11 +326,13 @@ def _share(journal: Journal) -> float:
     return share
 
 
-def _lines(frames: PickedFrames, outcome: Outcome) -> list[str]:
+def _lines(request: CaptureRequest, frames: PickedFrames, outcome: Outcome) -> list[str]:
     left_out = f" ({frames.blurred} blurred, {frames.alike} alike)" if frames.blurred or frames.alike else ""
+    missing = [] if frames.incomplete is None else [f"note: {request.source}: {frames.incomplete.describe()}"]
     return [
         f"{outcome.picked} of {frames.seen} frames picked{left_out}, {frames.size[0]} x {frames.size[1]}; "
         f"{100 * outcome.masked:.0f} % of their pixels move; {outcome.links.features} features a frame",
+        *missing,
     ]
 
 

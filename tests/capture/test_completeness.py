@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from helpers.films import cut_film, encoded, pan
+from helpers.films import cut_film, encoded, pan, spoil
 from scgs_warp.capture.completeness import Header, Incomplete, header_of, incomplete
 from scgs_warp.capture.source import Video
 from scgs_warp.errors import UserError
@@ -40,10 +40,7 @@ def test_a_copy_that_was_cut_off_is_noticed(tmp_path, name, options):
 def test_damage_within_a_film_is_noticed(tmp_path):
     path = tmp_path / "film.mp4"
     encoded(path, FRAMES, FASTSTART)
-    content = bytearray(path.read_bytes())
-    middle = len(content) // 2
-    content[middle : middle + len(content) // 4] = np.random.default_rng(1).bytes(len(content) // 4)
-    path.write_bytes(content)
+    spoil(path, 0.5, 0.25)
     decoded, found = read(path)
     assert found is not None and found.decoded == decoded < 90 and found.seconds > 3.8
 

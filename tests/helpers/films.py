@@ -86,3 +86,11 @@ def encoded(path: Path, count: int, options: dict[str, str] | None = None, sound
                 silence.sample_rate, silence.pts = 48000, 1024 * index
                 out.mux(track.encode(silence))
             out.mux(track.encode())
+
+
+def spoil(path: Path, begin: float, share: float) -> None:
+    """Overwrite a share of a film's bytes, beginning at another."""
+    content = bytearray(path.read_bytes())
+    at, length = int(begin * len(content)), int(share * len(content))
+    content[at : at + length] = np.random.default_rng(1).bytes(length)
+    path.write_bytes(content)

@@ -6,11 +6,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from ...errors import UserError
+from ..completeness import Incomplete, header_of, incomplete
 
 SAME_MOMENT = 0.08
 """Difference from an instant, as a share of the time between two frames, that is attributed to the error of the
@@ -40,8 +41,24 @@ class TimeLine:
         return (self.moments - first) / max(last - first, 1e-9)
 
 
+class Recorded(NamedTuple):
+    """What a video's stored pictures say without being decoded."""
+
+    seconds: np.ndarray
+    """[V] moments of the frames, counted from the first one."""
+    timed: bool
+    """False if the moments are those of an even rate, because the file does not say them."""
+    incomplete: Incomplete | None
+    """What is there of an incomplete video."""
+
+
 def frame_seconds(path: Path) -> np.ndarray:
-    """Return the moments [V] of a video's frames in seconds, counted from the first one; no picture is decoded.
+    """Return the moments [V] of a video's frames in seconds; see :func:`recorded`."""
+    return recorded(path).seconds
+
+
+def recorded(path: Path) -> Recorded:
+    """Read the moments of a video's frames; no picture is decoded.
 
     Raises:
         UserError: the file is no video.
@@ -55,7 +72,12 @@ def frame_seconds(path: Path) -> np.ndarray:
                 raise UserError(f"{path}: holds no pictures; take it out of the folder")
             stream: Any = container.streams.video[0]
             rate = float(stream.average_rate or 30)
-            stamps = [packet.pts for packet in container.demux(stream) if packet.size and not packet.is_discard]
+            header, hidden, stamps = header_of(container, stream), 0, []
+            for packet in container.demux(stream):
+                if packet.size and packet.is_discard:
+                    hidden += 1
+                elif packet.size and not packet.is_corrupt:  # as the last one of a copy that was cut off
+                    stamps.append(packet.pts)
             unit = float(stream.time_base)
     except (FFmpegError, OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or type(error).__name__
@@ -64,11 +86,13 @@ def frame_seconds(path: Path) -> np.ndarray:
     if not stamps or not 0.0 < rate < MAX_RATE:
         raise UserError(f"{path}: holds no frame that can be timed; save it as .mp4, or take it out")
     if len(known) != len(stamps):
-        return np.arange(len(stamps)) / rate
+        return Recorded(np.arange(len(stamps)) / rate, False, None)
     seconds = (np.array(known, np.float64) - known[0]) * unit
     if not np.isfinite(seconds).all() or seconds[-1] > MAX_SECONDS:
         raise UserError(f"{path}: its frames are {seconds[-1]:g} seconds apart; save it as .mp4, or take it out")
-    return seconds
+    length, latest = float(seconds[-1]), float(known[-1] * unit)
+    there = incomplete(header, rate, decoded=len(stamps), hidden=hidden, seconds=length, latest=latest)
+    return Recorded(seconds, True, there)
 
 
 def time_line(

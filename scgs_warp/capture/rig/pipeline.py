@@ -23,7 +23,7 @@ from ..journal import Journal
 from ..source import Video, read_rgb
 from ..writing import FILE
 from . import adjustment, cameras, still, synchronisation
-from .instants import TimeLine, frame_seconds, time_line
+from .instants import Recorded, TimeLine, recorded, time_line
 from .neural_video import POSES, known_cameras, write_neural_video
 from .points import points_at
 from .request import FEWEST_CAMERAS, RigRequest, check, videos_of
@@ -75,7 +75,7 @@ def capture_rig(request: RigRequest, folder: Path, *, device: str = "cpu", show:
         if not before:
             found = rig.points(known.cameras(rig.size_of))
             write_neural_video(folder, request.folder, names, len(line.seconds), rig.picture_file, found, show)
-        lines = [rig.describe(line), f"cameras of {request.folder.name}/poses_bounds.npy"]
+        lines = [rig.describe(line), f"cameras of {request.folder.name}/poses_bounds.npy", *rig.cut_off()]
         return RigResult(names, starts, names, names[0], lines, before)
     solved = rig.cameras(len(line.seconds))
     missing = [name for number, name in enumerate(names) if number not in solved.cameras]
@@ -85,7 +85,7 @@ def capture_rig(request: RigRequest, folder: Path, *, device: str = "cpu", show:
         raise UserError(f"--held-out {held_out}: its pose was not found; hold out another camera")
     lines = [rig.describe(line), rig.describe_clock(starts)]
     lines += [f"note: {', '.join(missing)} shares too little with the others and is left out"] if missing else []
-    lines += [*rig.unadjusted(), *rig.unsteady()]
+    lines += [*rig.cut_off(), *rig.unadjusted(), *rig.unsteady()]
     if not before:
         extra = rig.points(solved.cameras)
         scene = write_rig(folder, solved, extra, names, line, held_out, rig.picture, show)
@@ -110,6 +110,7 @@ class _Rig:
         digest = hashlib.sha256("".join(video.digest() for video in self.videos).encode()).hexdigest()
         self.journal = Journal(folder, digest, marker)
         self.work = self.journal.work
+        self.recorded: list[Recorded] = []
 
     def starts(self) -> list[float]:
         """Return the seconds at which the cameras begin: the given ones, or those found by sound."""
@@ -155,7 +156,8 @@ class _Rig:
     def frames(self, starts: list[float], everything: bool) -> TimeLine:
         """Choose the instants, and write each camera's frames."""
         request, folder = self.request, self.work / "frames"
-        own = [frame_seconds(file) for file in self.files]
+        self.recorded = [recorded(file) for file in self.files]
+        own = [each.seconds for each in self.recorded]
         count = len(own[0]) if everything and request.frames is None else request.frames
         line = time_line(self.names, starts, own, count, request.start, request.end)
 
@@ -174,8 +176,14 @@ class _Rig:
         wanted: dict[int, list[int]] = {}
         for instant, index in enumerate(line.frames[camera].tolist()):
             wanted.setdefault(index, []).append(instant)
-        left = len(line.seconds)
+        left, own = len(line.seconds), self.recorded[camera]
+        tolerated = 0.5 * float(np.median(np.diff(own.seconds)))
         for frame in video.frames(self.request.size, wanted):
+            if own.timed and abs(frame.seconds - own.seconds[frame.index]) > tolerated:
+                raise UserError(
+                    f"{video.path}: frames before second {frame.seconds:.2f} cannot be decoded; copy it again from "
+                    "where it was recorded, or leave out this part of all videos (--start, --end)"
+                )
             for instant in wanted[frame.index]:
                 write_png(self.picture_file(camera, instant), frame.image)
                 left -= 1
@@ -315,6 +323,11 @@ class _Rig:
         return (
             f"{len(self.names)} cameras, {len(line.seconds)} instants within {length:.2f} s that all of them recorded"
         )
+
+    def cut_off(self) -> list[str]:
+        """Name the videos that end before their headers say; they shorten the time of all cameras."""
+        found = zip(self.files, self.recorded)
+        return [f"note: {file}: {each.incomplete.describe()}" for file, each in found if each.incomplete is not None]
 
     def unadjusted(self) -> list[str]:
         """Say if the cameras could not be adjusted to matches of the still pictures."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 from contextlib import contextmanager
 from pathlib import Path
@@ -12,6 +13,7 @@ import numpy as np
 import pytest
 import torch
 
+from helpers.films import encoded, spoil
 from helpers.rigs import FPS, RigFilms, film_rig, write_poses_bounds
 from scgs_warp.apps import capture as app
 from scgs_warp.capture import RigRequest, capture_rig
@@ -209,3 +211,21 @@ def test_silent_films_and_blank_films(tmp_path):
     with pytest.raises(UserError, match="no two cameras see enough in common"):
         run(source, tmp_path / "blank", offsets=(0.0,))
     assert (tmp_path / "blank/contact_sheet.png").exists()
+
+
+def test_films_that_are_cut_off_or_damaged(tmp_path):
+    """What is left of a film is used, and said; moments are not guessed."""
+    source = tmp_path / "films"
+    source.mkdir()
+    for name in ("a", "b"):
+        encoded(source / f"{name}.mp4", 100, {"movflags": "faststart"})
+    content = (source / "a.mp4").read_bytes()
+    (source / "a.mp4").write_bytes(content[: 6 * len(content) // 10])
+    rig = pipeline._Rig(RigRequest(source), tmp_path / "out", [source / "a.mp4", source / "b.mp4"], "x", "cpu", silent)
+    rig.journal.start()
+    line = rig.frames([0.0, 0.0], everything=False)
+    assert 1.0 < line.seconds[-1] < 3.5 and len(rig.cut_off()) == 1
+    assert re.search(r"a\.mp4: \d\d of 100 frames can be decoded, until second", rig.cut_off()[0])
+    spoil(source / "b.mp4", 0.25, 0.1)
+    with pytest.raises(UserError, match=r"b\.mp4: frames before second \d\.\d\d cannot be decoded"):
+        run(source, tmp_path / "spoilt", offsets=(0.0,))
