@@ -97,7 +97,7 @@ def main() -> int:
     truth = [np.load(file)["moves"].astype(bool) for file in maps]
     images = [read_rgb(options.data / "images" / f"frame_{index:05d}.png") for index in range(len(maps))]
     kinds = {
-        "found": find_moving(images.__getitem__, len(images), lambda: None),
+        "found": list(find_moving(images.__getitem__, len(images))),
         "coarse": [coarse(mask) for mask in truth],
         "outside": [grown(mask, SHIFT) for mask in truth],
         "inside": [grown(mask, -SHIFT) for mask in truth],

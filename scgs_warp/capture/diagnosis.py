@@ -16,6 +16,9 @@ MAX_PLANAR = 0.97
 """Share of frame pairs explained by one homography; above it, the camera probably rotates without moving."""
 MIN_ARC = 2.0
 """Smallest useful angle between the rays to a point, degrees; at smaller angles, depth is unreliable."""
+MAX_MASKED = 0.5
+"""Share of masked pixels above which masks, and not a lack of texture, leave few features; masks that are found cover
+less."""
 GOOD_SHARE = 0.9
 """Share of registered frames above which the user gets no note."""
 
@@ -35,6 +38,11 @@ class Outcome(NamedTuple):
 def likely_reason(outcome: Outcome) -> str:
     """Return the likeliest cause of missing cameras, and its remedy."""
     links = outcome.links
+    if outcome.masked > MAX_MASKED and links.features < MIN_FEATURES:
+        return (
+            f"masks hide {100 * outcome.masked:.0f} % of the frames: they are black where something moves, and white "
+            "elsewhere; invert them if they are not, or give --masks none"
+        )
     if links.features < MIN_FEATURES:
         return (
             f"there is little to recognise ({links.features} features a frame): film something with texture, in more "

@@ -1,4 +1,4 @@
-"""Masks of independently moving pixels, from the user or from optical flow that disagrees with the static scene.
+"""Masks of independently moving pixels, from optical flow that disagrees with the static scene.
 
 Between two frames, the image of a static point moves along its epipolar line. The fundamental matrix that fits most of
 the optical flow describes the camera's motion; pixels whose flow leaves the epipolar lines move independently. Motion
@@ -7,16 +7,13 @@ along the lines, such as that of a car straight ahead, is not detected; robust m
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from pathlib import Path
+from collections.abc import Callable, Iterator
 
 import cv2
 import numpy as np
 
-from ..data.images import size_text
-from ..errors import UserError
 from ..geometry.optical_flow import at_targets, targets_of, textured
-from .source import Folder, Source, open_source, read_rgb, shrunk
+from .source import shrunk
 
 FLOW_SIDE = 480
 """Longer side of the images for optical flow, pixels."""
@@ -42,19 +39,17 @@ MIN_AREA = 0.001
 """Smallest connected area of a mask, as a share of the frame; smaller areas are errors of the flow."""
 
 
-def find_moving(load: Callable[[int], np.ndarray], count: int, done: Callable[[], object]) -> list[np.ndarray]:
+def find_moving(load: Callable[[int], np.ndarray], count: int) -> Iterator[np.ndarray]:
     """Find the moving pixels of ``count`` frames.
 
     Args:
         load: function from the frame number to [H, W, 3] uint8 RGB.
-        done: called after each frame.
 
-    Returns:
+    Yields:
         [H, W] bool for each frame, at the frame's size, True on moving pixels.
     """
     kept: dict[int, np.ndarray] = {}
     flows: dict[tuple[int, int], np.ndarray] = {}
-    masks = []
     search = cv2.DISOpticalFlow.create(cv2.DISOPTICAL_FLOW_PRESET_FAST)
 
     def flow(one: int, two: int) -> np.ndarray:
@@ -77,12 +72,10 @@ def find_moving(load: Callable[[int], np.ndarray], count: int, done: Callable[[]
                 votes += moves & sure
                 asked += sure
         mask = (votes >= 1) & (votes >= MIN_AGREEMENT * asked)
-        masks.append(_tidy(mask, size))
+        yield _tidy(mask, size)
         gone = index + min(STEPS)
         kept.pop(gone, None)
         flows = {pair: vectors for pair, vectors in flows.items() if min(pair) > gone}
-        done()
-    return masks
 
 
 def _gray(image: np.ndarray) -> np.ndarray:
@@ -142,67 +135,6 @@ def _tidy(mask: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     if pixels.mean() > MAX_MASK_SHARE:
         pixels[:] = 0
     return cv2.resize(pixels, size, interpolation=cv2.INTER_NEAREST).astype(bool)
-
-
-def read_masks(path: Path, source: Source, indices: Sequence[int], names: Sequence[str], size: tuple[int, int]) -> list:
-    """Read the user's masks, black on moving pixels, as in COLMAP and nerfstudio.
-
-    The masks are a video, or a folder with one mask for each frame of the source: with the same name for a folder of
-    images, in the order of names for a video. A folder may also hold masks of the picked frames only, named by their
-    numbers.
-
-    Args:
-        indices, names: indices and file names of the picked frames.
-        size: (width, height) of the frames.
-
-    Returns:
-        [H, W] bool for each picked frame, at ``size``, True on moving pixels.
-
-    Raises:
-        UserError: masks are missing, or do not fit the frames.
-    """
-    masks = open_source(path)
-    wanted = set(indices)
-    if isinstance(masks, Folder):
-        files = _paired(masks, source, indices, names)
-        images = [read_rgb(file) for file in files]
-    else:
-        by_index = {still.index: still.image for still in masks.frames(max(size)) if still.index in wanted}
-        missing = sorted(wanted - by_index.keys())
-        if missing:
-            raise UserError(
-                f"{path}: ends before frame {missing[0]} of {source.path}; give a mask for each frame of the video"
-            )
-        images = [by_index[index] for index in indices]
-    return [_given(image, path, size) for image in images]
-
-
-def _given(image: np.ndarray, path: Path, size: tuple[int, int]) -> np.ndarray:
-    ratio = image.shape[1] / image.shape[0] / (size[0] / size[1])
-    if abs(ratio - 1) > 0.02:
-        raise UserError(
-            f"{path}: holds masks of {size_text(image.shape[1::-1])}, frames are {size_text(size)}; give masks of the "
-            "frames' proportions"
-        )
-    return cv2.resize(image, size, interpolation=cv2.INTER_AREA).max(2) < 128
-
-
-def _paired(masks: Folder, source: Source, indices: Sequence[int], names: Sequence[str]) -> list[Path]:
-    """Return the file of each picked frame's mask."""
-    by_name = {file.name: file for file in masks.files} | {file.stem: file for file in masks.files}
-    if not source.video:
-        keys = [next((key for key in (f"{name}.png", Path(name).stem) if key in by_name), name) for name in names]
-    elif len(masks.files) > max(indices):
-        return [masks.files[index] for index in indices]
-    else:
-        keys = [frame_name(index) for index in indices]
-    missing = [key for key in keys if key not in by_name]
-    if missing:
-        raise UserError(
-            f"{masks.path}: no mask for {Path(missing[0]).stem} ({len(missing)} of {len(keys)} are missing); name "
-            "masks as their frames, or give one for each frame of the video"
-        )
-    return [by_name[key] for key in keys]
 
 
 def frame_name(index: int) -> str:

@@ -22,6 +22,7 @@ from .colmap import remove_database
 from .completeness import Incomplete
 from .diagnosis import Outcome, notes, too_few
 from .features import CameraModel, FrameFiles, Matching
+from .given_masks import read_masks
 from .journal import Journal
 from .limits import check_limits
 from .source import Source, SourceFrame, open_source, read_rgb
@@ -264,15 +265,17 @@ def _masks(
 
     def make() -> dict[str, Any]:
         mask_folder.mkdir(exist_ok=True)
+        if request.masks == "auto":
+            masks = moving.find_moving(lambda k: read_rgb(folder / files[k]), len(files))
+        else:
+            masks = read_masks(path, source, frames.indices, frames.names, frames.size)
+        shares = []
         with show(len(files), "finding what moves" if request.masks == "auto" else "reading masks") as bar:
-            if request.masks == "auto":
-                masks = moving.find_moving(lambda k: read_rgb(folder / files[k]), len(files), bar.advance)
-            else:
-                masks = moving.read_masks(path, source, frames.indices, frames.names, frames.size)
-                bar.advance(len(files))
-        for name, mask in zip(files, masks):
-            write_png(mask_folder / name, np.repeat(np.where(mask, 0, 255).astype(np.uint8)[..., None], 3, 2))
-        return {"share": float(np.mean([mask.mean() for mask in masks]))}
+            for name, mask in zip(files, masks, strict=True):  # strict: masks are checked once the last one is read
+                write_png(mask_folder / name, np.repeat(np.where(mask, 0, 255).astype(np.uint8)[..., None], 3, 2))
+                shares.append(mask.mean())
+                bar.advance()
+        return {"share": float(np.mean(shares))}
 
     kind = "auto" if request.masks == "auto" else open_source(path).digest()
     journal.stage("masks", kind, make, lambda: shutil.rmtree(mask_folder, ignore_errors=True))

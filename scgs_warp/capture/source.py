@@ -239,19 +239,24 @@ class Folder:
 
 def read_rgb(file: Path) -> np.ndarray:
     """Read [H, W, 3] uint8 RGB, rotated by its EXIF tags; raise UserError if the file is not an image."""
+    return cv2.cvtColor(read_image(file, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)
+
+
+def read_image(file: Path, flags: int) -> np.ndarray:
+    """Read an image as OpenCV does with these flags; raise UserError if the file is not an image."""
     try:
         data = np.fromfile(file, np.uint8)
         claim = oversized_claim(data.data)
         if claim is not None:
             raise UserError(f"{file}: says it is {claim} in {data.size} bytes; save it again, smaller")
-        image = cv2.imdecode(data, cv2.IMREAD_COLOR) if is_complete(data) else None
+        image = cv2.imdecode(data, flags) if is_complete(data) else None
     except OSError as error:
         raise UserError(f"{file}: cannot be read ({error.strerror}); make the file readable") from None
     except cv2.error:
         image = None
     if image is None:
         raise UserError(f"{file}: is not an image that decodes; save it again as PNG or JPEG, or take it out")
-    return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
+    return image
 
 
 def shrunk(image: np.ndarray, longest: int) -> np.ndarray:

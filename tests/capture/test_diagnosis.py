@@ -10,6 +10,9 @@ LINKS = Links(2000, 300, 1.0, 0.3)
 
 def test_the_likeliest_reason_is_given():
     assert "texture" in likely_reason(Outcome(50, 0, 0, Links(30, 0, 0.0, 0.0), 0.1))
+    assert (
+        "masks hide 90 %" in (said := likely_reason(Outcome(50, 0, 0, Links(30, 0, 0.0, 0.0), 0.9))) and "inv" in said
+    )
     assert "--frames 100" in likely_reason(Outcome(50, 4, 9, Links(2000, 12, 0.5, 0.2), 0.1))
     assert "--masks none" in likely_reason(Outcome(50, 4, 9, Links(2000, 12, 0.5, 0.2), 0.4))
     assert "walking" in likely_reason(Outcome(50, 0, 0, Links(2000, 300, 1.0, 1.0), 0.1))
