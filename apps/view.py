@@ -49,8 +49,8 @@ class Options:
     """Longer side of the film in pixels; the proportions are those of the training images."""
     fps: float = 30.0
     """Frames per second."""
-    time: float = 0.5
-    """Time that a turntable shows, from 0 to 1."""
+    time: float | None = None
+    """Time that a turntable shows, from 0 to 1; 0.5 by default. With a time, --mode is turntable."""
     frame: Literal["auto", "cameras", "subject"] = "auto"
     """What the camera keeps in the picture. cameras: what the training cameras saw; subject: all of the opaque scene,
     from all sides and at all times; auto: the subject if it is cut out, otherwise what the cameras saw."""
@@ -113,8 +113,10 @@ def check(options: Options) -> None:
         raise UserError(f"--size {options.size}: give 16 to {LARGEST_SIDE} pixels{needed}")
     if not video.SLOWEST <= options.fps <= 1000:
         raise UserError(f"--fps {options.fps:g}: give {video.SLOWEST} to 1000 frames a second")
-    if not 0 <= options.time <= 1:
+    if options.time is not None and not 0 <= options.time <= 1:
         raise UserError(f"--time {options.time:g}: give a time from 0 to 1")
+    if options.time is not None and options.mode == "time":
+        raise UserError(f"--time {options.time:g}: --mode time shows all times; leave one of the two out")
     video.check_path(options.output)
 
 
@@ -186,8 +188,8 @@ def film_views(options: Options, scene: Scene) -> list[tuple[Camera, float]]:
         else:
             path = turntable(overview, frames, options.size)
         given = [None] * frames
-    if options.mode == "turntable":
-        return [(camera, options.time) for camera in path]
+    if options.mode == "turntable" or options.time is not None:
+        return [(camera, 0.5 if options.time is None else options.time) for camera in path]
     last = max(len(path) - 1, 1)
     return [(camera, index / last if time is None else time) for index, (camera, time) in enumerate(zip(path, given))]
 

@@ -92,7 +92,7 @@ def retargeted(edit: Edit, stance: Stance, motion: BodyMotion, match: Mapping[st
     length = float(motion.seconds[-1])
     film = dataclasses.replace(edit.film, seconds=length)
     return dataclasses.replace(
-        edit, handles=handles, targets={}, keyframes=tuple(frames), holds=(), exaggerate=None, film=film,
+        edit, handles=handles, pins=(), targets={}, keyframes=tuple(frames), holds=(), exaggerate=None, film=film,
         playback=Playback(freeze=stance.time), skeleton=skeleton,
     )  # fmt: skip
 

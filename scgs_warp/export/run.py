@@ -175,6 +175,8 @@ def write_still(
 
 def _export_moving(request: ExportRequest, device: str) -> str:
     scene, session = _open(request, device), None
+    if request.edit is None and not scene.motion.moves:
+        _refuse_at_rest(request)
     if request.edit is not None or (request.kind not in FRAME_FORMATS and scene.motion.moves):
         session = _open_session(request, scene)
     parts = session.skeleton if session is not None and request.skeleton == "parts" else None
@@ -185,8 +187,6 @@ def _export_moving(request: ExportRequest, device: str) -> str:
         gaussians = keep_finite(at_rest(scene))
         write_glb(request.output, gaussians, scene.overview.up)
         return f"{len(gaussians.means):,} Gaussians that stand still"
-    if request.edit is None and not scene.motion.moves and request.kind not in SEQUENCES:
-        raise UserError(f"--format {request.kind}: {request.run} stands still; write its Gaussians as ply or glb")
     frames = even_moments(request.frames or FRAMES, request.fps or FPS)
     moments = film_moments(session) if session is not None and request.edit is not None else frames
     if request.kind in SEQUENCES:
@@ -199,6 +199,18 @@ def _export_moving(request: ExportRequest, device: str) -> str:
     if parts is not None:
         return _write_rig(request.output, session, parts, moments)
     return _write_skeleton(request, session, moments)
+
+
+def _refuse_at_rest(request: ExportRequest) -> None:
+    """Refuse what only a moving scene or an edit has."""
+    if request.kind != "glb" and request.kind not in SEQUENCES:
+        raise UserError(f"--format {request.kind}: {request.run} stands still; write its Gaussians as ply or glb")
+    if request.skeleton == "parts":
+        raise UserError(f"--skeleton parts: {request.run} stands still; give an --edit that poses it, or leave it out")
+    if request.kind == "glb":
+        for option in ("frames", "fps"):
+            if getattr(request, option) is not None:
+                raise UserError(f"--{option}: {request.run} stands still; leave it out")
 
 
 def _write_frames(

@@ -49,6 +49,11 @@ def test_turntable_moves_the_camera_round_a_standing_scene(monkeypatch, tmp_path
         assert same(frame, (FakeScene().render(camera, 0.25).rgb.numpy() * 255).round())
 
 
+def test_a_time_alone_is_that_of_the_whole_film(monkeypatch, tmp_path) -> None:
+    named = film(monkeypatch, tmp_path, "--mode", "turntable", "--time", "0.25")
+    assert all(same(a, b) for a, b in zip(film(monkeypatch, tmp_path, "--time", "0.25"), named, strict=True))
+
+
 def test_a_camera_path_and_its_times(monkeypatch, tmp_path) -> None:
     poses = [cameras.orbit_camera(FakeScene.overview, azimuth, 64) for azimuth in (0.0, 40.0)]
     flipped = np.diag([1.0, -1.0, -1.0, 1.0])
@@ -102,6 +107,7 @@ def test_trails_without_control_points_follow_gaussians(monkeypatch, tmp_path) -
         (["--size", "15"], "--size 15"),
         (["--fps", "0"], "--fps 0"),
         (["--time", "1.5"], "--time 1.5"),
+        (["--time", "0.5", "--mode", "time"], "--mode time shows all times"),
         (["--output", "film.avi"], "film.avi"),
         (["--run", "missing"], "missing"),
         (["--threads", "0"], "--threads 0"),

@@ -60,6 +60,12 @@ def test_a_scene_plays_its_own_motion_on_itself(session):
     assert session.edit.film.seconds == 2.0 and session.undo() and not session.edit.handles
 
 
+def test_pins_of_an_earlier_edit_do_not_hold_the_body(session):
+    session.pin(range(0, len(session), 3))
+    retarget(session, motion_of_session(session, 2.0))
+    assert not session.edit.pins and session.undo() and session.edit.pins
+
+
 @pytest.mark.parametrize("flip", [False, True])
 def test_limbs_point_where_those_of_the_source_point(session, flip):
     motion = arm_motion(-40.0, 50.0, flip)

@@ -363,6 +363,9 @@ def test_mistakes_are_one_line_and_leave_nothing(run, tmp_path, capsys):
         (["--ply", "a.ply", "--output", "b.html", "--edit", "e.json"], "no such file"),
         (["--ply", "a.ply", "--output", "b.json"], "a file of Gaussians has no cameras"),
         (["--run", still, "--output", "b.npz"], "stands still"),
+        (["--run", still, "--output", "b.glb", "--skeleton", "parts"], "--skeleton parts: "),
+        (["--run", still, "--output", "b.glb", "--frames", 9], "--frames: "),
+        (["--run", still, "--output", "b.glb", "--fps", 9], "--fps: "),
         (["--run", run, "--format", "cameras", "--output", "b.json"], "data.folder"),
     ]
     before = sorted(path.name for path in tmp_path.iterdir())
