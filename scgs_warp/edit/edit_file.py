@@ -51,7 +51,7 @@ def to_json(edit: Edit, engine: Engine) -> str:
         "version": VERSION,
         "scene": scene_of(engine),
         "skeleton": None if edit.skeleton is None else skeleton_file.to_plain(edit.skeleton),
-        "skin": None if edit.skeleton is None else edit.skin,
+        "skin": None if edit.skeleton is None and edit.skin == Edit().skin else edit.skin,
         "handles": [_handle_entry(handle) for handle in edit.handles],
         "pins": list(edit.pins),
         "targets": {name: _plain(target) for name, target in edit.targets.items()},

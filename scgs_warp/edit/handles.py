@@ -40,6 +40,14 @@ class Target:
     rotation: Quaternion = (1.0, 0.0, 0.0, 0.0)
     """wxyz, unit."""
 
+    def __post_init__(self) -> None:
+        """
+        Raises:
+            UserError: a number is not finite.
+        """
+        if not all(map(math.isfinite, (*self.translation, *self.rotation))):
+            raise UserError(f"target {list(self.translation)}, {list(self.rotation)}: give finite numbers")
+
     @staticmethod
     def of(translation: Sequence[float] | None = None, rotation: Sequence[float] | None = None) -> Target:
         """Check and normalise a target.

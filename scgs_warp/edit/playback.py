@@ -7,6 +7,12 @@ from typing import Literal
 
 import numpy as np
 
+from ..errors import UserError
+from .keyframes import MAX_SECONDS
+
+LIMITS = {"seconds": (1e-3, MAX_SECONDS), "speed": (-1000.0, 1000.0), "start": (0.0, 1.0), "freeze": (0.0, 1.0)}
+"""Smallest and largest value of each number of a playback."""
+
 
 @dataclass(frozen=True)
 class Playback:
@@ -24,6 +30,16 @@ class Playback:
     """Scene time to show throughout the film."""
     map: tuple[tuple[float, float], ...] = ()
     """Pairs (second of the film, scene time), interpolated linearly; they replace the fields above."""
+
+    def __post_init__(self) -> None:
+        """
+        Raises:
+            UserError: a number is outside its range.
+        """
+        for name, (least, most) in LIMITS.items():
+            value = getattr(self, name)
+            if value is not None and not least <= value <= most:
+                raise UserError(f"playback: {name} is {value:g}; give a number from {least:g} to {most:g}")
 
     def time_at(self, at: float, film_seconds: float) -> float:
         """Return the scene time in [0, 1] at a moment of the film."""

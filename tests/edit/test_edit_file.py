@@ -234,3 +234,8 @@ def test_a_region_of_several_kinds_is_refused(session, region, words):
 def test_exaggeration_of_no_list_of_control_points_is_refused(session, nodes):
     with pytest.raises(UserError, match=r"exaggerate\.nodes"):
         parse(changed("exaggerate.nodes", nodes), "x.json", session.engine)
+
+
+def test_the_skin_is_kept_before_any_part_is_posed(session, tmp_path):
+    EditSession(session.scene, Edit(skin="dual")).save(tmp_path / "edit.json")
+    assert read(tmp_path / "edit.json", session.engine).skin == "dual"

@@ -107,3 +107,9 @@ def test_a_handle_holds_plain_numbers():
     handle = Handle("a", (1,), time=1, pivot=[1, 2, 3], stiffness=np.float64(2.0))
     assert handle == Handle("a", (1,), 1.0, (1.0, 2.0, 3.0), 2.0) and hash(handle)
     assert [type(x) for x in (handle.time, *handle.pivot, handle.stiffness)] == [float] * 5
+
+
+@pytest.mark.parametrize("numbers", [((0.0, 0.0, float("nan")),), ((0.0, 0.0, 0.0), (float("inf"), 0.0, 0.0, 0.0))])
+def test_a_target_that_is_not_finite_is_refused(numbers):
+    with pytest.raises(UserError, match="give finite numbers"):
+        Target(*numbers)

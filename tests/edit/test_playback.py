@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 
 from scgs_warp.edit import Playback
+from scgs_warp.errors import UserError
 
 
 @pytest.mark.parametrize(
@@ -23,3 +24,9 @@ from scgs_warp.edit import Playback
 def test_playback(playback, times):
     found = [playback.time_at(moment, 4.0) for moment in (0.0, 1.0, 2.0, 4.0, 6.0)]
     assert found == pytest.approx(times)
+
+
+@pytest.mark.parametrize("field", [{"freeze": 3.0}, {"freeze": -0.1}, {"start": 2.0}, {"speed": float("nan")}])
+def test_a_scene_time_outside_the_motion_is_refused(field):
+    with pytest.raises(UserError, match=f"playback: {next(iter(field))} is"):
+        Playback(**field)
