@@ -22,6 +22,8 @@ from .colmap_model import ModelCamera, ModelImage, find_model, read_model
 
 SECONDS = re.compile(r"(?:.*[^0-9.A-Za-z])?([0-9]{1,15}\.[0-9]{1,15})")
 """Names that end with a decimal, which no letter precedes: ``cam1.0002`` is a camera and a frame."""
+CAMERA = re.compile(r"(?:camera|cam|view)[ _-]?[0-9]+", re.IGNORECASE)
+"""Number of a camera in a name, such as ``0001_cam2``."""
 MADE_FROM = "give the images that the model was made from, with their names"
 """What to do about missing images."""
 
@@ -104,8 +106,12 @@ def _fits(lens: Callable[[tuple[int, int]], Lens], size: tuple[int, int]) -> boo
 
 def times_from_names(names: list[str]) -> list[float]:
     """Return times in [0, 1]: from the last number in each name if all names have one and the numbers differ, else from
-    the order. Names that end with decimals, such as ``1311868164.363181``, have their times in seconds."""
+    the order. Names that end with decimals, such as ``1311868164.363181``, have their times in seconds. A number after
+    ``cam``, ``camera`` or ``view`` is that of a camera, unless the names have no other."""
     stems = [PurePosixPath(name).stem for name in names]
+    frames = [re.findall("[0-9]+", CAMERA.sub("", stem)) for stem in stems]
+    if all(frames) and len({numbers[-1] for numbers in frames}) > 1:
+        stems = [CAMERA.sub("", stem) for stem in stems]
     decimals = [SECONDS.fullmatch(stem) for stem in stems]
     seconds = [Fraction(found[1]) for found in decimals if found]
     digit_groups = [re.findall(r"[0-9]{1,15}", stem) for stem in stems]

@@ -1,7 +1,8 @@
 """Reader of the D-NeRF / Blender layout: ``transforms_{train,val,test}.json`` beside folders of images.
 
 ``camera_angle_x`` (horizontal field of view, radians) or ``fl_x, fl_y, cx, cy, w, h`` (pixels); per frame
-``file_path``, ``transform_matrix`` (camera-to-world, OpenGL: x right, y up, z backward) and ``time`` in [0, 1].
+``file_path``, ``transform_matrix`` (camera-to-world, OpenGL: x right, y up, z backward), ``time`` in [0, 1] and, if the
+frame has one, ``mask_path`` (black: not valid).
 Layout: Pumarola et al., D-NeRF, CVPR 2021, and NeRF's Blender scenes.
 """
 
@@ -16,7 +17,7 @@ from ..choice import Choice, choose, choose_instants, of_cameras, present
 from ..dataset import Dataset
 from ..held_out import held_out
 from ..images import ReadOptions
-from .transforms import find_image, read_distortion, read_lens, read_pose, read_times, read_transforms
+from .transforms import find_image, find_mask, read_distortion, read_lens, read_pose, read_times, read_transforms
 
 
 def transforms_path(folder: Path, split: str) -> Path:
@@ -54,7 +55,8 @@ def read(folder: Path, split: str, options: ReadOptions) -> Dataset:
         read_distortion(path, fields)
         lens = partial(read_lens, path, fields, index)
         states_size = "w" in fields or "h" in fields
-        frame = (files[index], poses[index], choice.times[index], lens, files[index].stem)
+        mask = find_mask(path, folder, index, entries[index])
+        frame = (files[index], poses[index], choice.times[index], lens, files[index].stem, mask)
         records.append(FrameRecord(*frame, states_size=states_size))
     return assemble(records, options, folder=folder, split=split, one_size=True, notes=choice.notes)
 

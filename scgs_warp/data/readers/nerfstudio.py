@@ -28,7 +28,7 @@ from ..held_out import held_out
 from ..images import ReadOptions
 from ..natural_order import by_name
 from ..points import read_points
-from .transforms import find_image, read_distortion, read_lens, read_pose, read_times, read_transforms
+from .transforms import find_image, find_mask, read_distortion, read_lens, read_pose, read_times, read_transforms
 
 FILE = "transforms.json"
 
@@ -66,7 +66,7 @@ def read(folder: Path, split: str, options: ReadOptions) -> Dataset:
         _record(path, folder, content, index, files[index], poses[index], choice.times[index]) for index in chosen
     ]
     border = video_border([files[index] for index in choice.indices], [times[index] for index in choice.indices])
-    notes = [*choice.notes, *([] if offset is None else [note(offset)])]
+    notes = [*choice.notes, *([] if offset is None else [note(offset)]), *_of_depth(path, content)]
     data = assemble(records, options, folder=folder, split=split, one_size=True, border=border, notes=notes)
     return with_points(data, *_points(path, folder, content, data.cameras, np.zeros(3) if offset is None else offset))
 
@@ -76,16 +76,13 @@ def _record(
 ) -> FrameRecord:
     entry = content["frames"][index]
     fields = {**content, **entry}
-    mask = entry.get("mask_path")
-    if mask is not None and not (isinstance(mask, str) and mask):
-        raise UserError(f"{path}: frames[{index}].mask_path is not text; name the mask's file or leave it out")
     return FrameRecord(
         file,
         pose,
         time,
         partial(read_lens, path, fields, index),
         file.stem,
-        None if mask is None else inside(folder, mask, f"{path}: frames[{index}].mask_path", "mask"),
+        find_mask(path, folder, index, entry),
         "w" in fields or "h" in fields,
         _depth(path, folder, content, index),
     )
@@ -104,15 +101,38 @@ def _depth(path: Path, folder: Path, content: dict[str, Any], index: int) -> Dep
     return DepthFile(inside(folder, name, f"{path}: frames[{index}].depth_file_path", "depth map"), unit)
 
 
+def _of_depth(path: Path, content: dict[str, Any]) -> list[str]:
+    """Return a note if depth maps of decimal numbers have no unit: nerfstudio takes them for millimetres."""
+    names = [entry.get("depth_file_path") for entry in content["frames"]]
+    decimal = any(isinstance(name, str) and name.lower().endswith((".npy", ".npz", ".exr")) for name in names)
+    if not decimal or "depth_unit_scale_factor" in content:
+        return []
+    return [f"{path} has no depth_unit_scale_factor: depth maps are read as millimetres; give 1 if they are in metres"]
+
+
 def _times(path: Path, entries: list[dict[str, Any]], files: list[Path]) -> list[float]:
     if any("time" in entry for entry in entries):
         return read_times(path, entries)
-    order = by_name(files)
-    last = max(len(files) - 1, 1)
-    times = [0.0] * len(files)
-    for rank, index in enumerate(order):
-        times[index] = rank / last
-    return times
+    moments = _moments(files)
+    last = max(len(set(moments)) - 1, 1)
+    return [moment / last for moment in moments]
+
+
+def _moments(files: list[Path]) -> list[int]:
+    """Return the number of each image's moment, by the order of names. Of several folders whose images have the same
+    names, those of one name are of one moment: the folders are cameras that record at once."""
+    named: dict[str, set[Path]] = {}
+    for file in files:
+        named.setdefault(file.stem, set()).add(file.parent)
+    shared = sum(len(folders) > 1 for folders in named.values())
+    if 2 * shared > len(named):
+        names = [Path(name) for name in named]
+        ranks = {names[index].name: rank for rank, index in enumerate(by_name(names))}
+        return [ranks[file.stem] for file in files]
+    moments = [0] * len(files)
+    for rank, index in enumerate(by_name(files)):
+        moments[index] = rank
+    return moments
 
 
 def _of_split(path: Path, content: dict[str, Any], files: list[Path], indices: list[int], split: str) -> list[int]:

@@ -30,6 +30,8 @@ PERSPECTIVES = ("PERSPECTIVE", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RA
 and tangential; for FULL_OPENCV the radial part is a quotient of polynomials."""
 FISHEYES = ("OPENCV_FISHEYE", "FISHEYE", "SIMPLE_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
 """Camera models in which the distance from the centre is a polynomial of the angle to the optical axis."""
+CORNER = 0.95
+"""Shares of width and height beyond which a principal point is that of larger images."""
 
 
 def read_transforms(path: Path) -> dict[str, Any]:
@@ -81,7 +83,8 @@ def read_times(path: Path, entries: list[dict[str, Any]]) -> list[float]:
         if time is None:
             raise UserError(f"{where} is {str(entry['time'])[:40]!r}, not a number; give a number from 0 to 1")
         if not 0.0 <= time <= 1.0:
-            raise UserError(f"{where} is {time:g}, outside [0, 1]; divide all times by the last one")
+            remedy = "subtract the first time from all, and divide by the last one"
+            raise UserError(f"{where} is {time:g}, outside [0, 1]; {remedy}")
         times.append(time)
     return times
 
@@ -119,6 +122,20 @@ def in_any_case(file: Path) -> Path | None:
     except OSError:
         return None
     return file.with_name(found[0]) if found and file.with_name(found[0]).is_file() else None
+
+
+def find_mask(path: Path, folder: Path, index: int, entry: dict[str, Any]) -> Path | None:
+    """Return the file of a frame's mask; None if it names none.
+
+    Raises:
+        UserError: the name is no text, or leads out of the folder.
+    """
+    mask = entry.get("mask_path")
+    if mask is None:
+        return None
+    if not (isinstance(mask, str) and mask):
+        raise UserError(f"{path}: frames[{index}].mask_path is not text; name the mask's file or leave it out")
+    return inside(folder, mask, f"{path}: frames[{index}].mask_path", "mask")
 
 
 def read_distortion(path: Path, fields: dict[str, Any]) -> tuple[str, tuple[float, ...]]:
@@ -218,6 +235,37 @@ def read_intrinsics(
         if angle is None or not 0.0 < angle < math.pi:
             raise UserError(f"{path}: camera_angle_x is {fields['camera_angle_x']!r}; give radians between 0 and pi")
         fx = fy = 0.5 * width / math.tan(0.5 * angle)
+        if "camera_angle_y" in fields:
+            angle = as_number(fields["camera_angle_y"])
+            if angle is None or not 0.0 < angle < math.pi:
+                raise UserError(
+                    f"{path}: camera_angle_y is {fields['camera_angle_y']!r}; give radians between 0 and pi"
+                )
+            fy = 0.5 * height / math.tan(0.5 * angle)
     else:
         raise UserError(f"{path}: neither camera_angle_x nor fl_x is given; add the field of view in radians")
-    return fx, fy, number("cx", 0.5 * width), number("cy", 0.5 * height)
+    cx, cy = number("cx", 0.5 * width), number("cy", 0.5 * height)
+    _check_units(path, index, (fx, fy, cx, cy), source)
+    return fx, fy, cx, cy
+
+
+def _check_units(
+    path: Path, index: int, intrinsics: tuple[float, float, float, float], source: tuple[int, int]
+) -> None:
+    """Refuse intrinsics in shares of the image's size, or of images of another size: cameras would see next to
+    nothing.
+
+    Raises:
+        UserError: the intrinsics are not those of images of this size.
+    """
+    fx, _, cx, cy = intrinsics
+    if 0.0 < cx <= 1.0 and 0.0 < cy <= 1.0 and fx < 10.0 and min(source) > 16:
+        raise UserError(
+            f"{path}: frame {index} has fl_x {fx:g}, cx {cx:g} and cy {cy:g}, shares of the images' size; "
+            f"give them for images of {size_text(source)}"
+        )
+    if cx > CORNER * source[0] and cy > CORNER * source[1]:
+        raise UserError(
+            f"{path}: frame {index} has cx {cx:g} and cy {cy:g}, the lower right corner of images of "
+            f"{size_text(source)}; give the intrinsics of images of this size"
+        )

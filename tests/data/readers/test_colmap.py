@@ -68,6 +68,9 @@ def test_colmap(tmp_path, model, text):
         (["8.3.png", "8.75.png", "9.031.png", "10.3.png"], [0.0, 0.225, 0.3655, 1.0]),  # seconds
         (["take 2.9.png", "take 2.10.png", "take 2.11.png"], [0.0, 0.5, 1.0]),
         (["cam1.0001.png", "cam1.0002.png", "cam2.0001.png", "cam2.0002.png"], [0.0, 1.0, 0.0, 1.0]),
+        (["0000_cam1.png", "0000_cam2.png", "0003_cam1.png", "0004_cam2.png"], [0.0, 0.0, 0.75, 1.0]),
+        (["Camera 1-0005.png", "Camera 2-0005.png", "Camera 2-0009.png"], [0.0, 0.0, 1.0]),
+        (["cam_0001.png", "cam_0002.png", "cam_0005.png"], [0.0, 0.25, 1.0]),
         (["v1.2_0003.png", "v2.2_0004.png", "v3.2_0007.png"], [0.0, 0.25, 1.0]),
     ],
 )

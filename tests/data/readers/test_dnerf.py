@@ -40,6 +40,26 @@ def test_pixel_intrinsics_and_index_times(tmp_path):
     assert data.times.tolist() == [0.0, 0.5, 1.0] and data[0].alpha is None
 
 
+def test_two_angles_of_view(tmp_path):
+    write_scene(tmp_path / "s", camera_angle_y=0.5)
+    K = load(tmp_path / "s", "train")[0].camera.K
+    assert float(K[0, 0]) == pytest.approx(0.5 * WIDTH / math.tan(0.4))
+    assert float(K[1, 1]) == pytest.approx(0.5 * HEIGHT / math.tan(0.25))
+    edit(tmp_path / "s", lambda content: content.update(camera_angle_y=4))
+    with pytest.raises(UserError, match="camera_angle_y is 4; give radians"):
+        load(tmp_path / "s", "train")
+
+
+def test_masks_of_frames(tmp_path):
+    write_scene(tmp_path / "s")
+    mask = np.full((HEIGHT, WIDTH), 255, np.uint8)
+    mask[:, :9] = 0
+    PillowImage.fromarray(mask).save(tmp_path / "s/mask.png")
+    edit(tmp_path / "s", lambda content: content["frames"][1].__setitem__("mask_path", "mask.png"))
+    data = load(tmp_path / "s", "train")
+    assert torch.equal(data[1].mask, torch.from_numpy(mask > 0)) and data[0].mask is None
+
+
 def frame_field(key, value):
     return lambda content: content["frames"][1].__setitem__(key, value)
 

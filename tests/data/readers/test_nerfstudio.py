@@ -80,6 +80,30 @@ def test_times_follow_the_names_where_there_are_none(tmp_path):
     assert times["f_9"] == 9 / 19 and times["f_10"] == 10 / 19
 
 
+def test_cameras_that_record_at_once_share_their_times(tmp_path):
+    """Folders whose images have the same names are cameras of one moment each; others follow one another."""
+    content = write(tmp_path)
+    for index, entry in enumerate(content["frames"]):
+        del entry["time"]
+        name = f"cam{index % 2}/{index // 2:03d}.png"
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / entry["file_path"]).rename(tmp_path / name)
+        entry["file_path"] = name
+    save(tmp_path, {**content, "train_filenames": [entry["file_path"] for entry in content["frames"]]})
+    assert np.allclose(load(tmp_path).times, [index // 2 / 9 for index in range(20)])
+
+
+def test_depth_maps_of_decimals_without_a_unit_are_noted(tmp_path):
+    content = write(tmp_path)
+    np.save(tmp_path / "depth.npy", np.full((HEIGHT, WIDTH), 4.0, np.float32))
+    for entry in content["frames"]:
+        entry["depth_file_path"] = "depth.npy"
+    save(tmp_path, content)
+    assert any("read as millimetres" in note for note in load(tmp_path).notes)
+    save(tmp_path, {**content, "depth_unit_scale_factor": 1.0})
+    assert not any("millimetres" in note for note in load(tmp_path).notes)
+
+
 def test_intrinsics_of_a_frame_win(tmp_path):
     content = write(tmp_path)
     content["frames"][2] |= {"fl_x": 60.0, "fl_y": 70.0, "cx": 21.0}
@@ -174,6 +198,14 @@ FAULTS = {
     "transform": (lambda content: content.__setitem__("applied_transform", [[1, 2]]), "applied_transform must be"),
     "scale": (lambda content: content.__setitem__("applied_scale", -1), "applied_scale a positive"),
     "focal": (lambda content: content.pop("fl_x"), "fl_x"),
+    "shares": (
+        lambda content: [content.update(fl_x=1.2, cx=0.5, cy=0.5), content.pop("w"), content.pop("h")],
+        "frame 0 has fl_x 1.2, cx 0.5 and cy 0.5, shares of the images' size; give them for images of 40 x 30 pixels",
+    ),
+    "larger images": (
+        lambda content: [content.update(fl_x=100.0, cx=40.0, cy=30.0), content.pop("w"), content.pop("h")],
+        "has cx 40 and cy 30, the lower right corner of images of 40 x 30 pixels; give the intrinsics of",
+    ),
     "time": (lambda content: content["frames"][0].__setitem__("time", 3), "frames[0].time is 3, outside"),
     "split": (lambda content: content.__setitem__("train_filenames", []), "train_filenames is empty"),
     "pose": (lambda content: content["frames"][0].__setitem__("transform_matrix", [[1]]), "frames[0].transform_matrix"),
