@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import re
+import shutil
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -11,6 +13,7 @@ from typing import Any
 
 from ..errors import UserError
 from ..runtime.pycolmap_import import import_pycolmap
+from ..storage.files import temporary_of
 
 HEADER = b"SQLite format 3\0"
 """First bytes of a database."""
@@ -79,3 +82,61 @@ def remove_database(database: Path) -> None:
     """Remove a database, and the log that a killed process left: SQLite would play it into a new database."""
     for suffix in ("", "-wal", "-shm"):
         Path(f"{os.fspath(database)}{suffix}").unlink(missing_ok=True)
+
+
+def write_model(model: Any, folder: Path) -> None:
+    """Write a reconstruction. The folder appears when it is complete; pycolmap itself would keep silent about a full
+    disk.
+
+    Raises:
+        UserError: it cannot be written.
+    """
+    new = temporary_of(folder)
+    try:
+        shutil.rmtree(new, ignore_errors=True)
+        new.mkdir()
+        with quiet():
+            model.write_binary(new)
+        for file in new.iterdir():
+            with open(file, "rb+") as opened_file:
+                os.fsync(opened_file.fileno())
+        if not _is_whole(model, new):
+            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+        shutil.rmtree(folder, ignore_errors=True)
+        os.replace(new, folder)
+    except OSError as error:
+        shutil.rmtree(new, ignore_errors=True)
+        raise UserError(
+            f"{folder}: cannot be written ({error.strerror}); make room, and give the same command again (finished "
+            "work is kept)"
+        ) from None
+
+
+def _is_whole(model: Any, folder: Path) -> bool:
+    """Return whether the files of a reconstruction, in COLMAP's binary format, are as large as they must be."""
+    with quiet():
+        images = [image for image in model.images.values() if image.has_pose]
+        sizes = {
+            "cameras.bin": sum(24 + 8 * len(lens.params) for lens in model.cameras.values()),
+            "rigs.bin": 16 * len(model.rigs),
+            "frames.bin": 84 * model.num_reg_frames(),
+            "images.bin": sum(73 + len(image.name.encode()) + 24 * len(image.points2D) for image in images),
+            "points3D.bin": sum(51 + 8 * point.track.length() for point in model.points3D.values()),
+        }
+    return all((folder / name).is_file() and (folder / name).stat().st_size >= 8 + size for name, size in sizes.items())
+
+
+def read_model(folder: Path) -> Any:
+    """Read a reconstruction.
+
+    Raises:
+        UserError: it is damaged.
+    """
+    with quiet() as pycolmap:
+        try:
+            model = pycolmap.Reconstruction(folder)
+        except (RuntimeError, ValueError, IndexError, MemoryError):
+            raise damaged(folder) from None
+    if not _is_whole(model, folder):
+        raise damaged(folder)
+    return model

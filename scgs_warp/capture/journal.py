@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import errno
 import hashlib
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +18,7 @@ from .writing import FILE, write_text
 WORK = "work"
 """Folder of intermediate files; it may be deleted when the data set is complete."""
 JOURNAL = "journal.json"
+NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EROFS)
 
 
 class Journal:
@@ -104,6 +107,24 @@ class Journal:
     def _save(self) -> None:
         content = {"source": self._source, "stages": self._stages}
         write_text(self.file, json.dumps(content, indent=1) + "\n")
+
+
+@contextmanager
+def disk_errors(folder: Path) -> Iterator[None]:
+    """Convert errors of a full disk, which need not name a file, to UserError.
+
+    Args:
+        folder: folder of the capture.
+    """
+    try:
+        yield
+    except OSError as error:
+        if error.errno not in NO_ROOM:
+            raise
+        raise UserError(
+            f"{folder}: cannot be written ({error.strerror}); make room, and give the same command again (finished "
+            "work is kept)"
+        ) from None
 
 
 def _read(file: Path) -> dict[str, Any] | None:

@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .colmap import quiet
+from .colmap import database_errors, quiet, read_model, write_model
 from .features import FrameFiles
 
 MIN_VIEWS = 3
@@ -50,11 +50,14 @@ def solve(database: Path, frame_files: FrameFiles, folder: Path, seed: int, done
 
     Returns:
         Number of frames registered in the largest model; 0 without a model.
+
+    Raises:
+        UserError: the model cannot be written.
     """
     attempts = folder.with_name(f"{folder.name}-attempts")
     shutil.rmtree(attempts, ignore_errors=True)
     attempts.mkdir(parents=True)
-    with quiet() as pycolmap:
+    with quiet() as pycolmap, database_errors(database):
         options = pycolmap.IncrementalPipelineOptions(num_threads=1, random_seed=seed, min_model_size=3)
         options.mapper.num_threads = 1
         options.mapper.random_seed = seed
@@ -65,9 +68,7 @@ def solve(database: Path, frame_files: FrameFiles, folder: Path, seed: int, done
         )
         best = max(models.values(), key=lambda model: (model.num_reg_images(), model.num_points3D()), default=None)
         if best is not None and best.num_reg_images():
-            shutil.rmtree(folder, ignore_errors=True)
-            folder.mkdir()
-            best.write_binary(folder)
+            write_model(best, folder)
     shutil.rmtree(attempts, ignore_errors=True)
     return 0 if best is None else best.num_reg_images()
 
@@ -77,11 +78,11 @@ def _ignore(_: object) -> None:
 
 
 def read_solution(folder: Path, frame_files: FrameFiles) -> CameraSolution | None:
-    """Read the model written by :func:`solve`; return None without a model."""
+    """Read the model written by :func:`solve`; return None without a model, raise UserError if it is damaged."""
     if not (folder / "images.bin").is_file():
         return None
-    with quiet() as pycolmap:
-        model = pycolmap.Reconstruction(folder)
+    model = read_model(folder)
+    with quiet():
         numbers = {name: number for number, name in enumerate(frame_files.names)}
         images = {numbers[image.name]: image for image in model.images.values() if image.has_pose}
         places = sorted(images)

@@ -23,7 +23,7 @@ from .completeness import Incomplete
 from .diagnosis import Outcome, notes, too_few
 from .features import CameraModel, FrameFiles, Matching
 from .given_masks import read_masks
-from .journal import Journal
+from .journal import Journal, disk_errors
 from .limits import check_limits
 from .source import Source, SourceFrame, open_source, read_rgb
 
@@ -143,8 +143,15 @@ def capture(
     source = open_source(request.source)
     if request.masks not in ("auto", "none"):
         open_source(Path(request.masks))
-    journal = Journal(folder, source.digest())
-    before = journal.finished
+    with disk_errors(folder):
+        return _capture(request, source, Journal(folder, source.digest()), device, show)
+
+
+def _capture(
+    request: CaptureRequest, source: Source, journal: Journal, device: str, show: ShowProgress
+) -> CaptureResult:
+    """Run or resume all stages."""
+    folder, before = journal.folder, journal.finished
     journal.start()
     frames = _frames(request, source, journal, show)
     _enough(request, frames)

@@ -18,6 +18,7 @@ import torch
 
 pytest.importorskip("pygltflib")
 
+from helpers.full_disk import small_disk
 from helpers.paths import ROOT
 from helpers.room import Film, path_length, save, shoot
 from scgs_warp.capture import CaptureRequest, capture, mapping, pipeline
@@ -237,6 +238,20 @@ def test_images_that_have_nothing_in_common(tmp_path):
     assert "\n" not in str(error.value)
     assert (tmp_path / "out/contact_sheet.png").is_file() and len(list((tmp_path / "out/work/frames").iterdir())) == 7
     assert not (tmp_path / "out/transforms.json").exists()
+
+
+def test_a_full_disk_is_said_and_work_goes_on(tmp_path):
+    (tmp_path / "images").mkdir()
+    for index in range(7):
+        picture = np.random.default_rng(index).integers(0, 256, (120, 160, 3), np.uint8)
+        write_png(tmp_path / f"images/{index}.png", picture)
+    with small_disk(tmp_path / "disk", 4) as disk:
+        (tmp_path / "disk/ballast").write_bytes(bytes(4_000_000))
+        with pytest.raises(UserError, match=r"out: cannot be written \(No space left on device\); make room"):
+            run(tmp_path / "images", tmp_path / "disk/out", masks="none", features=64)
+        disk.free()
+        with pytest.raises(UserError, match="0 of 7 frames registered"):
+            run(tmp_path / "images", tmp_path / "disk/out", masks="none", features=64)
 
 
 def test_a_film_without_texture(tmp_path):

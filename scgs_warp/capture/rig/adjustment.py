@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import copy
 import math
-import shutil
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -23,7 +22,7 @@ from ...geometry.optical_flow import at_targets, dense_flow, returns, targets_of
 from ...geometry.stereo import StereoPair, stereo_pairs
 from ...geometry.view_rays import pixels_of, ray_of
 from ...types import Camera
-from ..colmap import quiet
+from ..colmap import quiet, read_model, write_model
 from ..features import FrameFiles
 from ..source import read_rgb
 from .cameras import RigCamera, median_error, solution_of, straightened
@@ -115,12 +114,10 @@ def adjusted(model: Any, stills: FrameFiles, done: Callable[[int], object] = lam
 
 def adjust(folder: Path, stills: FrameFiles, target: Path, done: Callable[[int], object] = lambda _: None) -> bool:
     """Read the model in a folder, and write the adjusted one to another. Return whether they differ."""
-    with quiet() as pycolmap:
-        before = pycolmap.Reconstruction(folder)
+    before = read_model(folder)
+    with quiet():
         model = adjusted(before, stills, done)
-        shutil.rmtree(target, ignore_errors=True)  # an interrupted attempt
-        target.mkdir()
-        model.write_binary(target)
+    write_model(model, target)
     return model is not before
 
 

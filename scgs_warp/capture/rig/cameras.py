@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..colmap import quiet
+from ..colmap import database_errors, quiet, read_model, write_model
 from ..features import FrameFiles
 from ..mapping import MAX_ERROR
 
@@ -57,10 +57,13 @@ def solve(database: Path, stills: FrameFiles, folder: Path, seed: int) -> int:
 
     Returns:
         Number of cameras found; 0 without a model.
+
+    Raises:
+        UserError: the model cannot be written.
     """
     attempts = folder.with_name(f"{folder.name}-attempts")
     best, most = None, 0
-    with quiet() as pycolmap:
+    with quiet() as pycolmap, database_errors(database):
         for inliers in FEW_INLIERS:
             shutil.rmtree(attempts, ignore_errors=True)
             attempts.mkdir(parents=True)
@@ -80,10 +83,7 @@ def solve(database: Path, stills: FrameFiles, folder: Path, seed: int) -> int:
                 break
         shutil.rmtree(attempts, ignore_errors=True)
         if best is not None:
-            best = straightened(best)
-            shutil.rmtree(folder, ignore_errors=True)
-            folder.mkdir()
-            best.write_binary(folder)
+            write_model(straightened(best), folder)
     return most
 
 
@@ -128,11 +128,12 @@ def median_error(model: Any) -> float:
 
 
 def read_solution(folder: Path, names: Sequence[str]) -> RigSolution | None:
-    """Read the model written by :func:`solve`; return None without a model."""
+    """Read the model written by :func:`solve`; return None without a model, raise UserError if it is damaged."""
     if not (folder / "images.bin").is_file():
         return None
-    with quiet() as pycolmap:
-        return solution_of(pycolmap.Reconstruction(folder), names)
+    model = read_model(folder)
+    with quiet():
+        return solution_of(model, names)
 
 
 def solution_of(model: Any, names: Sequence[str]) -> RigSolution:

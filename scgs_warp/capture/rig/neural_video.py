@@ -15,6 +15,7 @@ from ...data.points import write_points
 from ...data.readers.poses_bounds import FILE as POSES
 from ...data.readers.poses_bounds import POINTS, read_rows, row_lens, row_viewmat
 from ...errors import UserError
+from ...storage.files import read_bytes, write_atomically
 from .cameras import RigCamera
 
 
@@ -81,7 +82,7 @@ def write_neural_video(
                 _link(picture_file(number, instant), images / f"{instant:04d}.png")
                 bar.advance()
     write_points(folder / POINTS[0], *points)
-    shutil.copyfile(source / POSES, folder / POSES)
+    write_atomically(folder / POSES, read_bytes(source / POSES, "put it beside the videos again"))
 
 
 def _link(source: Path, target: Path) -> None:

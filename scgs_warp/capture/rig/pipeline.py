@@ -19,12 +19,12 @@ from ...visualization.video import write_png
 from .. import features, pictures
 from ..colmap import remove_database
 from ..features import FrameFiles
-from ..journal import Journal
+from ..journal import Journal, disk_errors
 from ..source import Video, read_rgb
 from ..writing import FILE
 from . import adjustment, cameras, still, synchronisation
 from .instants import Recorded, TimeLine, recorded, time_line
-from .neural_video import POSES, known_cameras, write_neural_video
+from .neural_video import POSES, KnownCameras, known_cameras, write_neural_video
 from .points import points_at
 from .request import FEWEST_CAMERAS, RigRequest, check, videos_of
 from .sound import read_sound
@@ -66,7 +66,17 @@ def capture_rig(request: RigRequest, folder: Path, *, device: str = "cpu", show:
     names = [file.stem for file in files]
     check(request, names)
     known = known_cameras(request.folder, files)
-    rig = _Rig(request, folder, files, FILE if known is None else POSES, device, show)
+    with disk_errors(folder):
+        return _capture(_Rig(request, folder, files, FILE if known is None else POSES, device, show), known)
+
+
+def _capture(rig: _Rig, known: KnownCameras | None) -> RigResult:
+    """Run or resume all stages.
+
+    Args:
+        known: cameras that need not be found.
+    """
+    request, folder, files, names, show = rig.request, rig.folder, rig.files, rig.names, rig.show
     before = rig.journal.finished
     rig.journal.start()
     starts = [0.0] * len(files) if known is not None and request.offsets is None else rig.starts()
@@ -88,8 +98,7 @@ def capture_rig(request: RigRequest, folder: Path, *, device: str = "cpu", show:
     lines += [*rig.cut_off(), *rig.unadjusted(), *rig.unsteady()]
     if not before:
         extra = rig.points(solved.cameras)
-        scene = write_rig(folder, solved, extra, names, line, held_out, rig.picture, show)
-        pictures.cameras(folder / "cameras.png", scene)
+        write_rig(folder, solved, extra, names, line, held_out, rig.picture, show)
     return RigResult(names, starts, [n for n in names if n not in missing], held_out, lines, before)
 
 

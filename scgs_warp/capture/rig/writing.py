@@ -15,6 +15,7 @@ import numpy as np
 from ...data.points import write_points
 from ...data.readers.transforms import OPENGL_TO_OPENCV
 from ...visualization.video import write_png
+from .. import pictures
 from ..similarity import upright
 from ..writing import FILE, POINTS, CapturedScene, Pinhole, pinhole_of, write_text
 from .cameras import RigCamera, RigSolution
@@ -55,8 +56,9 @@ def write_rig(
     held_out: str,
     picture: Callable[[int, int], np.ndarray],
     show: Callable[[int, str], AbstractContextManager[Any]],
-) -> CapturedScene:
-    """Write ``images/``, ``points.ply`` and then ``transforms.json``, whose presence marks a complete folder.
+) -> None:
+    """Write ``images/``, ``points.ply``, a plot of the cameras, and then ``transforms.json``, whose presence marks a
+    complete folder.
 
     Args:
         points: points and colours of the first instant, in the frame of ``solved``.
@@ -64,9 +66,6 @@ def write_rig(
         held_out: name of the camera for ``test``.
         picture: function from the numbers of a camera and an instant to the recorded image.
         show: shows progress.
-
-    Returns:
-        The first instant, for the plot of the cameras.
     """
     (folder / "images").mkdir(exist_ok=True)
     pinholes = common_pinholes(solved.cameras)
@@ -97,6 +96,9 @@ def write_rig(
                 )
                 bar.advance()
     write_points(folder / POINTS, moved.points(all_points), colors)
+    pinhole = next(iter(pinholes.values()))[0]
+    scene = _first_instant(turned, line, names, pinhole, moved.points(all_points), colors)
+    pictures.cameras(folder / "cameras.png", scene)
     content = {
         "camera_model": "PINHOLE",
         "ply_file_path": POINTS,
@@ -105,11 +107,20 @@ def write_rig(
         "test_filenames": splits["test"],
     }
     write_text(folder / FILE, json.dumps(content, indent=1) + "\n")
-    first = [float(line.moments[number, 0]) for number in solved.cameras]
-    cameras = moved.viewmats(viewmats)
-    labels = [names[number] for number in solved.cameras]
-    pinhole = next(iter(pinholes.values()))[0]
-    return CapturedScene(pinhole, cameras, [0.0] * len(first), first, labels, moved.points(all_points), colors)
+
+
+def _first_instant(
+    viewmats: dict[int, np.ndarray],
+    line: TimeLine,
+    names: list[str],
+    pinhole: Pinhole,
+    points: np.ndarray,
+    colors: np.ndarray,
+) -> CapturedScene:
+    """Return the cameras at the first instant, for their plot."""
+    seconds = [float(line.moments[number, 0]) for number in viewmats]
+    labels = [names[number] for number in viewmats]
+    return CapturedScene(pinhole, np.stack([*viewmats.values()]), [0.0] * len(labels), seconds, labels, points, colors)
 
 
 def _split(number: int, instant: int, names: list[str], held_out: str, count: int) -> str:

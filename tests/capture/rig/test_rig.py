@@ -14,10 +14,12 @@ import pytest
 import torch
 
 from helpers.films import encoded, spoil
+from helpers.full_disk import FakeDisk
 from helpers.rigs import FPS, RigFilms, film_rig, write_poses_bounds
 from scgs_warp.apps import capture as app
-from scgs_warp.capture import RigRequest, capture_rig
+from scgs_warp.capture import RigRequest, capture_rig, pictures
 from scgs_warp.capture.rig import pipeline
+from scgs_warp.capture.rig.neural_video import write_neural_video
 from scgs_warp.capture.rig.points import points_at
 from scgs_warp.capture.similarity import align, centres
 from scgs_warp.data import load
@@ -133,6 +135,29 @@ def test_cameras_that_are_not_adjusted_are_named(films, captured, tmp_path):
     journal["stages"]["adjustment"]["result"] = False
     (other / "work/journal.json").write_text(json.dumps(journal))
     assert any(line.startswith("note: ") and "adjust" in line for line in run(films.folder, other).lines)
+
+
+def test_a_folder_is_complete_once_all_is_written(films, captured, tmp_path, monkeypatch):
+    """A full disk or Ctrl-C at the last file leaves no folder that passes for a finished one."""
+    folder = tmp_path / "rig"
+    shutil.copytree(captured, folder)
+    (folder / "transforms.json").unlink()
+
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(pictures, "cameras", interrupted)
+        run(films.folder, folder)
+    assert not (folder / "transforms.json").exists() and not run(films.folder, folder).made_before
+    (tmp_path / "poses_bounds.npy").write_bytes(b"poses")
+    points = np.zeros((1, 3)), np.zeros((1, 3), np.uint8)
+    (tmp_path / "out").mkdir()
+    disk = FakeDisk(monkeypatch, ("poses_bounds.npy",))
+    disk.full = True
+    with pytest.raises((UserError, OSError), match="No space left on device"):
+        write_neural_video(tmp_path / "out", tmp_path, [], 0, lambda *_: tmp_path, points, silent)
+    assert not (tmp_path / "out/poses_bounds.npy").exists()
 
 
 def test_videos_of_neural_3d_video_are_unpacked(films, tmp_path, capsys):
