@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import hashlib
 import json
+import re
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -18,6 +19,8 @@ from .writing import FILE, write_text
 WORK = "work"
 """Folder of intermediate files; it may be deleted when the data set is complete."""
 JOURNAL = "journal.json"
+LEFT = re.compile(r"\.journal\.json\.\w+\.tmp")
+"""Names of what a killed writer of the journal leaves."""
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EROFS)
 
 
@@ -41,7 +44,7 @@ class Journal:
         self._source = self._key = hashlib.sha256(source.encode()).hexdigest()
         self._stages: dict[str, dict[str, Any]] = {}
         if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-            content = _read(self.file)
+            content = {"source": self._source, "stages": {}} if self._is_bare() else _read(self.file)
             if content is None:
                 raise UserError(f"{folder}: exists and holds something else; give another --output, or remove it")
             if content.get("source") != self._source:
@@ -52,6 +55,13 @@ class Journal:
                 name: entry for name, entry in content["stages"].items() if isinstance(entry, dict) and "key" in entry
             }
         self.finished = (folder / marker).exists()
+
+    def _is_bare(self) -> bool:
+        """Return whether the folder holds only what an attempt leaves that ends before its first entry: on a full disk,
+        or by a kill."""
+        if not self.folder.is_dir() or self.work.is_symlink() or [*self.folder.iterdir()] != [self.work]:
+            return False
+        return self.work.is_dir() and all(LEFT.fullmatch(path.name) for path in self.work.iterdir())
 
     def start(self) -> None:
         """Make the folder."""

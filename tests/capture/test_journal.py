@@ -6,6 +6,7 @@ import json
 
 import pytest
 
+from helpers.full_disk import FakeDisk
 from scgs_warp.capture.journal import Journal
 from scgs_warp.errors import UserError
 
@@ -38,3 +39,21 @@ def test_the_journal_does_work_once(tmp_path):
     with pytest.raises(UserError, match="something else"):
         run(tmp_path / "mine")
     assert json.loads((tmp_path / "x/work/journal.json").read_text())["stages"]["a"]["result"] == {"v": 1}
+
+
+def test_an_attempt_that_ended_before_its_first_entry_is_no_obstacle(tmp_path, monkeypatch):
+    disk = FakeDisk(monkeypatch, ("journal.json",))
+    disk.full = True
+    with pytest.raises(UserError, match=r"journal\.json: cannot be written \(No space left on device\)"):
+        Journal(tmp_path / "out", "film").start()
+    assert (tmp_path / "out/work").is_dir()
+    disk.full = False
+    (tmp_path / "out/work/.journal.json.0a1b2c3d.tmp").write_bytes(b"")
+    Journal(tmp_path / "out", "film").start()
+    assert [path.name for path in (tmp_path / "out/work").iterdir()] == ["journal.json"]
+    Journal(tmp_path / "out", "film").start()
+    for name in ("letter.txt", "work/letter.txt"):
+        (tmp_path / f"{name[0]}/work").mkdir(parents=True)
+        (tmp_path / name[0] / name).write_text("dear")
+        with pytest.raises(UserError, match="something else"):
+            Journal(tmp_path / name[0], "film")
