@@ -117,7 +117,7 @@ class Video:
         self.incomplete, read = None, _Read()
         with self._opened() as container:
             stream = container.streams.video[0]
-            stream.thread_type = "AUTO"
+            stream.thread_type = "SLICE"  # Threads of frames lose more or fewer of those before a damaged one.
             shape = float(stream.sample_aspect_ratio or 1)
             size, last = None, 0.0
             frames = rising(read.frames(container, stream), self.rate, self._delay)
