@@ -94,3 +94,17 @@ def spoil(path: Path, begin: float, share: float) -> None:
     at, length = int(begin * len(content)), int(share * len(content))
     content[at : at + length] = np.random.default_rng(1).bytes(length)
     path.write_bytes(content)
+
+
+def cut_copy(path: Path, to: Path, share: float) -> None:
+    """Copy a film, its header first, and cut the copy off after a share of its bytes."""
+    import av
+
+    with av.open(str(path)) as film, av.open(str(to), "w", options={"movflags": "faststart"}) as out:
+        streams = {stream.index: out.add_stream_from_template(stream) for stream in film.streams}
+        for packet in film.demux():
+            if packet.size:
+                packet.stream = streams[packet.stream.index]
+                out.mux(packet)
+    content = to.read_bytes()
+    to.write_bytes(content[: int(share * len(content))])

@@ -13,6 +13,8 @@ RATE = 16_000
 """Samples per second at which sound is compared."""
 MAX_SECONDS = 300.0
 """Length of the beginning of a sound track that is read."""
+LEAST_SECONDS = 2.0
+"""Least length of the sound before damage, or before the end of a copy that was cut off, for it to be used."""
 
 
 class Sound(NamedTuple):
@@ -25,7 +27,7 @@ class Sound(NamedTuple):
 
 
 def read_sound(path: Path) -> Sound | None:
-    """Read the first ``MAX_SECONDS`` of a video's sound; return None if it has none.
+    """Read the first ``MAX_SECONDS`` of a video's sound, or what precedes damage; return None if it has none.
 
     Raises:
         UserError: the file cannot be decoded.
@@ -41,14 +43,18 @@ def read_sound(path: Path) -> Sound | None:
             container.seek(0)
             pieces, start, length = [], None, 0
             resampler = av.AudioResampler(format="flt", layout="mono", rate=RATE)
-            for frame in container.decode(audio=0):
-                if start is None:
-                    start = float(frame.pts * frame.time_base) if frame.pts is not None else 0.0
-                fresh = [piece.to_ndarray()[0] for piece in resampler.resample(frame)]
-                pieces += fresh
-                length += sum(len(piece) for piece in fresh)
-                if length > MAX_SECONDS * RATE:
-                    break
+            try:
+                for frame in container.decode(audio=0):
+                    if start is None:
+                        start = float(frame.pts * frame.time_base) if frame.pts is not None else 0.0
+                    fresh = [piece.to_ndarray()[0] for piece in resampler.resample(frame)]
+                    pieces += fresh
+                    length += sum(len(piece) for piece in fresh)
+                    if length > MAX_SECONDS * RATE:
+                        break
+            except FFmpegError:  # The sound before the damage has no gaps, and it suffices.
+                if length < LEAST_SECONDS * RATE:
+                    raise
             pieces += [piece.to_ndarray()[0] for piece in resampler.resample(None)]
     except (FFmpegError, OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or type(error).__name__

@@ -5,10 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from helpers.films import cut_copy, spoil
 from scgs_warp.capture.rig.sound import RATE, Sound, read_sound
 from scgs_warp.capture.rig.synchronisation import PairOffset, solve, synchronise
 from scgs_warp.data.synthetic.films.encoding import write_film
 from scgs_warp.data.synthetic.films.sound import SAMPLE_RATE, clap_shapes, clap_times, heard
+from scgs_warp.errors import UserError
 
 FPS = 30.0
 
@@ -99,6 +101,20 @@ def test_many_cameras_are_compared_with_some_others():
     sounds = [Sound(room[shift : shift + 3 * RATE], 0.0) for shift in shifts]
     found = synchronise(sounds).starts
     np.testing.assert_allclose(found, (shifts - shifts.min()) / RATE, atol=1e-3)
+
+
+def test_sound_before_damage_is_used(tmp_path):
+    """Of a copy that was cut off, or whose later part is damaged; too little is refused."""
+    starts = np.array([0.13, 0.0, 0.3])
+    files = record(tmp_path, starts, seconds=6.0)
+    cut_copy(files[1], tmp_path / "cut.mp4", 0.7)
+    spoil(files[2], 0.55, 0.2)
+    sounds = [read_sound(file) for file in (files[0], tmp_path / "cut.mp4", files[2])]
+    assert all(sound is not None and 2.0 < len(sound.samples) / RATE < 5.0 for sound in sounds[1:])
+    assert np.abs(synchronise(sounds).starts - starts).max() < 0.002
+    cut_copy(files[1], tmp_path / "cut.mp4", 0.15)
+    with pytest.raises(UserError, match=r"cut\.mp4: its sound does not decode .*--offsets"):
+        read_sound(tmp_path / "cut.mp4")
 
 
 def test_a_film_without_sound_has_none(tmp_path):
