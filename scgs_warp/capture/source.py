@@ -215,7 +215,8 @@ class Folder:
             UserError: the folder holds no images.
         """
         self.path = path
-        files = [file for file in path.iterdir() if file.suffix.lower() in SUFFIXES and file.is_file()]
+        found = [file for file in path.iterdir() if file.suffix.lower() in SUFFIXES and file.is_file()]
+        files = [file for file in found if is_shown(file)]
         self.files = sorted(files, key=lambda file: natural(file.name))
         self.count = len(files)
         if not files:
@@ -235,6 +236,11 @@ class Folder:
 
     def digest(self) -> str:
         return _digest(self.files)
+
+
+def is_shown(file: Path) -> bool:
+    """Return whether a file is none that macOS hides beside each file (``._1.png``) on disks of other systems."""
+    return not file.name.startswith("._")
 
 
 def read_rgb(file: Path) -> np.ndarray:

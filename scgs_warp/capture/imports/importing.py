@@ -103,13 +103,26 @@ def import_scene(path: Path, folder: Path, show: ShowProgress = progress) -> Imp
     latest = max(abs(frame.moment) for frame in scene.frames)
     if not latest < MAX_MOMENT:
         raise UserError(f"{path}: a frame has the time {latest:g}; export the scene again")
-    made: list[tuple[int, float | None]] = []
+    made: list[_Written] = []
     write_folder_atomically(folder, lambda work: made.append(_write(work, path, scene, show)))
-    return ImportResult(scene.program, len(scene.frames), *made[0], scene.note)
+    notes = [scene.note] if scene.note else []
+    if made[0].without_depth:
+        share = f"{made[0].without_depth} of {len(scene.frames)} frames"
+        notes.append(f"{share} have no depth map, or one that is empty or of other proportions than the image")
+    return ImportResult(scene.program, len(scene.frames), made[0].points, made[0].pose_error, "; ".join(notes) or None)
 
 
-def _write(work: Path, path: Path, scene: ImportedScene, show: ShowProgress) -> tuple[int, float | None]:
-    """Write the folder; return the number of points and the error of the poses."""
+class _Written(NamedTuple):
+    """What was written."""
+
+    points: int
+    pose_error: float | None
+    without_depth: int
+    """Number of frames without a depth map in a scene that has depth."""
+
+
+def _write(work: Path, path: Path, scene: ImportedScene, show: ShowProgress) -> _Written:
+    """Write the folder."""
     (work / "images").mkdir()
     frames = scene.frames
     chosen = set(spread(len(frames), POINT_FRAMES))
@@ -152,7 +165,8 @@ def _write(work: Path, path: Path, scene: ImportedScene, show: ShowProgress) -> 
     with show(len(agreement.pairs(len(frames))), "comparing the poses with the images") as bar:
         lenses = [frame.K for frame in frames]
         error = agreement.pose_error(lambda index: read_rgb(work / names[index]), viewmats, lenses, bar.advance)
-    return len(points), error
+    has_depth = any(frame.depth is not None for frame in frames)
+    return _Written(len(points), error, maps.count(None) if has_depth else 0)
 
 
 def _write_image(folder: Path, frame: ImportedFrame, stem: str) -> tuple[np.ndarray, str]:

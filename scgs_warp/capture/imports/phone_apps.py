@@ -33,6 +33,7 @@ from ...data.natural_order import natural
 from ...errors import UserError
 from ...storage.exr_files import INSTALL, read_exr, reads_exr
 from ...storage.json_files import as_number, read_json
+from ..source import is_shown
 from .monst3r import quaternion_matrix
 from .scene import ImportedFrame, ImportedScene, from_arkit, intrinsics, rigid
 
@@ -56,8 +57,8 @@ def read_polycam(path: Path) -> ImportedScene:
     base = path / "keyframes"
     corrected = (base / "corrected_cameras").is_dir() and (base / "corrected_images").is_dir()
     cameras, images = (base / f"{'corrected_' if corrected else ''}{name}" for name in ("cameras", "images"))
-    frames = []
-    for file in _files(cameras, "*.json"):
+    frames, files = [], _files(cameras, "*.json")
+    for file in files:
         content = read_json(file, "export the capture again")
         rows = [[_number(file, content, f"t_{row}{column}") for column in range(4)] for row in range(3)]
         K = _pinhole(*(_number(file, content, key) for key in ("fx", "fy", "cx", "cy")))
@@ -74,7 +75,9 @@ def read_polycam(path: Path) -> ImportedScene:
                 _depth_of(*(base / kind / f"{file.stem}.png" for kind in ("depth", "confidence"))),
             )
         )
-    return ImportedScene("Polycam", frames, gravity=True)
+    missing = len(files) - len(frames)
+    note = f"{missing} of {len(files)} cameras have no image in {images.name}, and are left out" if missing else None
+    return ImportedScene("Polycam", frames, gravity=True, note=note)
 
 
 def is_record3d(path: Path) -> bool:
@@ -103,7 +106,7 @@ def read_record3d(path: Path) -> ImportedScene:
     file, folder = place
     content = read_json(file, "export the capture again")
     poses = _table(file, content, "poses", 7)
-    images = sorted((f for f in folder.iterdir() if f.suffix.lower() in IMAGE_SUFFIXES), key=lambda f: natural(f.name))
+    images = [file for file in _files(folder, "*") if file.suffix.lower() in IMAGE_SUFFIXES]
     if len(images) != len(poses):
         raise UserError(f"{file}: has {len(poses)} poses, but {folder} holds {len(images)} images; export it again")
     if "perFrameIntrinsicCoeffs" in content:
@@ -157,7 +160,7 @@ def read_scanner(path: Path) -> ImportedScene:
 
 
 def _files(folder: Path, pattern: str) -> list[Path]:
-    return sorted(folder.glob(pattern), key=lambda file: natural(file.name))
+    return sorted(filter(is_shown, folder.glob(pattern)), key=lambda file: natural(file.name))
 
 
 def _image(folder: Path, stem: str) -> Path | None:
