@@ -131,6 +131,18 @@ def test_a_finished_capture_is_left_alone(filmed, captured, tmp_path):
     assert files == {file: file.stat().st_mtime_ns for file in files}
 
 
+def test_a_capture_that_an_earlier_version_finished_is_left_alone(filmed, captured, tmp_path):
+    """Such a journal does not say whether the film is complete."""
+    folder = tmp_path / "room"
+    shutil.copytree(captured, folder)
+    journal = json.loads((folder / "work/journal.json").read_text())
+    for name in ("decoded", "announced"):
+        assert journal["stages"]["frames"]["result"].pop(name) == 0
+    (folder / "work/journal.json").write_text(json.dumps(journal))
+    made = run(filmed[1], folder, **OPTIONS)
+    assert made.made_before and len(made.lines) == 1
+
+
 def test_the_background_alone(filmed, captured, tmp_path):
     """Frames name the masks of what moves, cameras and points stay; the folder keeps to its settings."""
     folder = tmp_path / "room"

@@ -96,8 +96,7 @@ def write_rig(
                 )
                 bar.advance()
     write_points(folder / POINTS, moved.points(all_points), colors)
-    pinhole = next(iter(pinholes.values()))[0]
-    scene = _first_instant(turned, line, names, pinhole, moved.points(all_points), colors)
+    scene = _first_instant(turned, line, names, next(iter(pinholes.values()))[0], moved.points(all_points), colors)
     pictures.cameras(folder / "cameras.png", scene)
     content = {
         "camera_model": "PINHOLE",
