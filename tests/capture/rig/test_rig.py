@@ -22,6 +22,7 @@ from scgs_warp.capture.rig import pipeline
 from scgs_warp.capture.rig.neural_video import write_neural_video
 from scgs_warp.capture.rig.points import points_at
 from scgs_warp.capture.similarity import align, centres
+from scgs_warp.capture.source import Video
 from scgs_warp.data import load
 from scgs_warp.data.synthetic.films.encoding import write_film
 from scgs_warp.errors import UserError
@@ -236,6 +237,20 @@ def test_silent_films_and_blank_films(tmp_path):
     with pytest.raises(UserError, match="no two cameras see enough in common"):
         run(source, tmp_path / "blank", offsets=(0.0,))
     assert (tmp_path / "blank/contact_sheet.png").exists()
+
+
+@pytest.mark.parametrize("kind", ["avi", "mkv"])
+def test_frames_of_other_containers_have_their_moments(tmp_path, kind):
+    files = [tmp_path / f"films/{name}.{kind}" for name in ("a", "b")]
+    files[0].parent.mkdir()
+    for file in files:
+        encoded(file, 40)
+    rig = pipeline._Rig(RigRequest(files[0].parent), tmp_path / "out", files, "x", "cpu", silent)
+    rig.journal.start()
+    line = rig.frames([0.0, 0.08], everything=False)
+    np.testing.assert_allclose(line.moments, np.tile(np.arange(38) / 25, (2, 1)), atol=1e-9)
+    shown = list(Video(files[1]).frames(1280))
+    assert all(np.array_equal(rig.picture(1, instant), shown[instant].image) for instant in range(38))
 
 
 def test_films_that_are_cut_off_or_damaged(tmp_path):
