@@ -14,6 +14,7 @@ from typing import Any
 from ..errors import UserError
 from ..runtime.pycolmap_import import import_pycolmap
 from ..storage.files import temporary_of
+from .model_files import is_complete
 
 HEADER = b"SQLite format 3\0"
 """First bytes of a database."""
@@ -100,7 +101,7 @@ def write_model(model: Any, folder: Path) -> None:
         for file in new.iterdir():
             with open(file, "rb+") as opened_file:
                 os.fsync(opened_file.fileno())
-        if not _is_whole(model, new):
+        if not is_complete(new):
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         shutil.rmtree(folder, ignore_errors=True)
         os.replace(new, folder)
@@ -112,31 +113,16 @@ def write_model(model: Any, folder: Path) -> None:
         ) from None
 
 
-def _is_whole(model: Any, folder: Path) -> bool:
-    """Return whether the files of a reconstruction, in COLMAP's binary format, are as large as they must be."""
-    with quiet():
-        images = [image for image in model.images.values() if image.has_pose]
-        sizes = {
-            "cameras.bin": sum(24 + 8 * len(lens.params) for lens in model.cameras.values()),
-            "rigs.bin": 16 * len(model.rigs),
-            "frames.bin": 84 * model.num_reg_frames(),
-            "images.bin": sum(73 + len(image.name.encode()) + 24 * len(image.points2D) for image in images),
-            "points3D.bin": sum(51 + 8 * point.track.length() for point in model.points3D.values()),
-        }
-    return all((folder / name).is_file() and (folder / name).stat().st_size >= 8 + size for name, size in sizes.items())
-
-
 def read_model(folder: Path) -> Any:
     """Read a reconstruction.
 
     Raises:
         UserError: it is damaged.
     """
+    if not is_complete(folder):
+        raise damaged(folder)
     with quiet() as pycolmap:
         try:
-            model = pycolmap.Reconstruction(folder)
+            return pycolmap.Reconstruction(folder)
         except (RuntimeError, ValueError, IndexError, MemoryError):
             raise damaged(folder) from None
-    if not _is_whole(model, folder):
-        raise damaged(folder)
-    return model
