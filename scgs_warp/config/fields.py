@@ -234,7 +234,7 @@ class DensifyConfig:
     many as have together at most this share of the contributions of all (of each the largest to a sampled view). 0:
     off."""
     prune_large: Literal["auto", "always", "never"] = "auto"
-    """Apply max_screen and max_scale. auto: only with alpha, because others show bare walls, of large Gaussians."""
+    """Apply max_screen and max_scale. auto: only with alpha; without it, bare walls need large Gaussians."""
     max_screen: float = bounded(0.05, 0, 1e3)
     """Prune Gaussians that cover more than this share of the image (after the first opacity reset). 0: off."""
     max_scale: float = bounded(0.1, 0, 1e3)

@@ -21,7 +21,7 @@ from .field_reader import FieldReader, one_line, read_object, show_value
 from .handles import Handle, Target, handle_fields
 from .keyframes import MAX_SECONDS, Keyframe, keyframe_fields
 from .part_skin import SkinName
-from .playback import Exaggerate, Hold, Playback
+from .playback import LIMITS, Exaggerate, Hold, Playback
 from .rotations import from_axis
 from .skeleton import Skeleton
 
@@ -300,11 +300,11 @@ def _playback(fields: FieldReader | None) -> Playback:
             )
         pairs.append((at, time))
     playback = Playback(
-        seconds=fields.number("seconds", None, 1e-3, MAX_SECONDS),
-        speed=fields.number("speed", 1.0, -1000.0, 1000.0),
-        start=fields.number("start", 0.0, 0.0, 1.0),
+        seconds=fields.number("seconds", None, *LIMITS["seconds"]),
+        speed=fields.number("speed", 1.0, *LIMITS["speed"]),
+        start=fields.number("start", 0.0, *LIMITS["start"]),
         repeat=fields.choice("repeat", ("once", "loop", "swing"), "once"),
-        freeze=fields.number("freeze", None, 0.0, 1.0),
+        freeze=fields.number("freeze", None, *LIMITS["freeze"]),
         map=tuple(pairs),
     )
     fields.done()

@@ -1,0 +1,89 @@
+"""What the program that exports says: mistakes in one line, and what was written."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import torch
+
+from helpers.export_runs import export, moving_run, save, still_scene
+from scgs_warp.apps import export as app
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory) -> Path:
+    return moving_run(tmp_path_factory.mktemp("runs") / "run")
+
+
+def test_mistakes_are_one_line_and_leave_nothing(run, tmp_path, capsys):
+    (tmp_path / "folder.ply").mkdir()
+    still = save(still_scene(), tmp_path / "still")
+    cases = [
+        (["--output", "a.ply"], "--run and --ply"),
+        (["--run", run, "--output", "a.xyz"], "--format"),
+        (["--run", run, "--output", "a.ply", "--format", "glb"], ".glb"),
+        (["--run", run, "--output", "folder.ply"], "folder"),
+        (["--run", run, "--output", "a.ply", "--time", 1.5], "--time 1.5"),
+        (["--run", run, "--output", "a.npz", "--time", 0.5], "--time 0.5"),
+        (["--run", run, "--output", "a.ply", "--at", 0.5], "--edit"),
+        (["--run", run, "--output", "a.npz", "--frames", 0], "--frames 0"),
+        (["--run", run, "--output", "a.npz", "--fps", 0], "--fps 0"),
+        (["--ply", "a.ply", "--output", "b.spz", "--time", 0.5], "--time 0.5: a file of Gaussians has no times"),
+        (["--run", run, "--output", "b.spz", "--frames", 9], "--frames: "),
+        (["--run", run, "--output", "b.glb", "--time", 0.2, "--frames", 10], "leave out --time"),
+        (["--ply", "a.ply", "--output", "b.glb", "--fps", 10], "--fps: "),
+        (["--run", run, "--output", "b.html", "--frames", 9], "--frames: --format html has no frames"),
+        (["--run", run, "--output", "b.htm", "--fps", 9], "--fps: --format html has no frames"),
+        (["--run", run, "--output", "b.json", "--fps", 9], "--fps: --format cameras has no frames"),
+        (["--run", run, "--output", "b", "--format", "ply-sequence", "--fps", 9], "--fps: a ply-sequence"),
+        (["--run", run, "--output", "b.npz", "--skeleton", "parts"], "--skeleton parts: "),
+        (["--run", run, "--output", "b.glb", "--skeleton", "parts", "--time", 0.1], "leave out --time"),
+        (["--run", run, "--output", "b.npz", "--points", 3], "--points 3: belongs to tracks"),
+        (["--run", run, "--output", "b.csv", "--points", 0], "--points 0: give 1 to"),
+        (["--run", run, "--output", "b.csv", "--points", tmp_path / "none.csv"], "none.csv"),
+        (["--run", run, "--output", "b.obj", "--format", "tracks"], ".csv or .npz or .glb for"),
+        (["--run", run, "--output", "b.4dgs", "--frames", 1], "--frames 2"),
+        (["--run", still, "--output", "b.4dgs"], "stands still"),
+        (["--run", run, "--output", "b.npz", "--title", "x"], "--title: belongs to a page"),
+        (["--run", run, "--output", "b.glb", "--max-mib", 3], "--max-mib: belongs to a page"),
+        (["--run", run, "--output", "b.html", "--max-mib", 0.001], "0.001 MiB of --max-mib"),
+        (["--run", run, "--output", Path.cwd(), "--format", "ply-sequence"], "is the current folder"),
+        (["--run", tmp_path / "nowhere", "--output", "a.ply"], "nowhere"),
+        (["--ply", "a.ply", "--output", "b.spz"], "no such file"),
+        (["--ply", "a.ply", "--output", "b.npz"], "--run"),
+        (["--ply", "a.ply", "--output", "b.html", "--edit", "e.json"], "no such file"),
+        (["--ply", "a.ply", "--output", "b.json"], "a file of Gaussians has no cameras"),
+        (["--run", still, "--output", "b.npz"], "stands still"),
+        (["--run", still, "--output", "b.glb", "--skeleton", "parts"], "--skeleton parts: "),
+        (["--run", still, "--output", "b.glb", "--frames", 9], "--frames: "),
+        (["--run", still, "--output", "b.glb", "--fps", 9], "--fps: "),
+        (["--run", run, "--format", "cameras", "--output", "b.json"], "data.folder"),
+    ]
+    before = sorted(path.name for path in tmp_path.iterdir())
+    for arguments, words in cases:
+        output = arguments.index("--output") + 1
+        arguments = [tmp_path / a if i == output or a == "a.ply" else a for i, a in enumerate(arguments)]
+        assert app.cli([*map(str, arguments), "--device", "cpu"]) == 2, arguments
+        lines = capsys.readouterr().err.strip().splitlines()
+        assert len(lines) == 1 and words in lines[0], lines
+    assert sorted(path.name for path in tmp_path.iterdir()) == before
+
+
+def test_what_is_said_counts_what_is_written(run, tmp_path, capsys):
+    scene = still_scene()
+    with torch.no_grad():
+        scene.gaussians.opacity_logits[0] = -9.0
+        scene.gaussians.opacity_logits[1] = -9.0
+        scene.gaussians.sh_rest.clamp_(-0.9, 0.9)[2, 4, 1] = 1.5
+        scene.gaussians.log_scales[3] = -20.0
+    still = save(scene, tmp_path / "still")
+    for arguments, words in (
+        (["--run", still, "--output", tmp_path / "a.htm"], "a.htm: 18 Gaussians that stand still,"),
+        (["--run", run, "--output", tmp_path / "a.html"], "a.html: 120 Gaussians and their motion,"),
+        (["--run", still, "--output", tmp_path / "f", "--frames", 2], "f: 2 frames of 20 Gaussians,"),
+        (["--run", still, "--output", tmp_path / "a.spz"], "20 Gaussians at rest (4 values clipped to what .spz can"),
+        (["--run", run, "--output", tmp_path / "b.spz"], "b.spz: 120 Gaussians at rest"),
+    ):
+        export(*arguments)
+        assert words in capsys.readouterr().out
