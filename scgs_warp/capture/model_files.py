@@ -8,6 +8,7 @@ from pathlib import Path
 
 from ..data.readers.colmap_model import read_model
 from ..errors import UserError
+from ..storage.files import read_bytes
 
 FILES = ("cameras.bin", "images.bin", "points3D.bin", "rigs.bin", "frames.bin")
 RIG_BYTES = 16
@@ -22,7 +23,8 @@ def is_complete(folder: Path) -> bool:
         return False
     try:
         read_model(folder)
-        return _holds_frames((folder / "frames.bin").read_bytes()) and _holds_rigs((folder / "rigs.bin").read_bytes())
+        frames, rigs = (read_bytes(folder / f"{name}.bin", "") for name in ("frames", "rigs"))
+        return _holds_frames(frames) and _holds_rigs(rigs)
     except (UserError, struct.error):
         return False
 
