@@ -3,8 +3,9 @@
 Patches merge in three stages. First those whose union moves most rigidly (Ward's criterion), pairwise in rounds, down
 to a few dozen parts. Then patches change to a neighbouring part whose motion explains theirs better, so that early
 mistakes do not last. Last, neighbouring parts merge in the order of the angle by which they turn against each other,
-until every pair turns by more than the least angle of a joint; bands of skin at joints (``joint_bands``) go to the
-parts beside them, and parts that the motion does not tell apart merge (``shared_motion``). An angle, other than a
+until every pair turns by more than the least angle of a joint. Parts of very few patches merge before all others, again
+by Ward's criterion: they show where they go, but hardly how they turn. Bands of skin at joints (``joint_bands``) go to
+the parts beside them, and parts that the motion does not tell apart merge (``shared_motion``). An angle, other than a
 distance, neither favours large parts nor splits a body whose surface drifts slowly, and so the number of parts follows
 from the motion.
 
@@ -80,11 +81,15 @@ def find_parts(patches: Patches, count: int | None = None) -> np.ndarray:
         pairs = _neighbors(patches.edges, labels)
         if not len(pairs):
             break
+        small = pairs[np.bincount(labels)[pairs].min(1) < least]
+        if len(small):
+            costs = _costs(patches.moments.pooled(labels, parts), small)
+            labels = _joined(labels, small[costs.argmin()])
+            continue
         turns, widths = relative_turns(*fits.robust(labels), pairs), _widths(patches.edges, labels, pairs)
-        small = np.bincount(labels)[pairs].min(1) < least
         excess = turns / widths.clip(NARROW_TURN, 1.0)
-        chosen = int(np.where(small, turns - 2.0 * math.pi, excess).argmin())
-        if count is None and excess[chosen] > LEAST_TURN and not small[chosen]:
+        chosen = int(excess.argmin())
+        if count is None and excess[chosen] > LEAST_TURN:
             pooled, motions = fits.robust(labels)
             band = find_band(pooled, motions, pairs, partial(relative_turns, pooled, motions))
             if band is not None:
@@ -96,7 +101,7 @@ def find_parts(patches: Patches, count: int | None = None) -> np.ndarray:
             if shared is None:
                 break
             chosen = int(close[shared])
-        labels = _renumbered(np.where(labels == pairs[chosen, 1], pairs[chosen, 0], labels))
+        labels = _joined(labels, pairs[chosen])
     sizes = np.bincount(labels, weights=patches.moments.count)
     rank = np.empty(len(sizes), np.int64)
     rank[np.argsort(-sizes, kind="stable")] = np.arange(len(sizes))
@@ -219,6 +224,10 @@ def _renumbered(labels: np.ndarray) -> np.ndarray:
     return np.unique(labels, return_inverse=True)[1].reshape(-1)
 
 
+def _joined(labels: np.ndarray, pair: np.ndarray) -> np.ndarray:
+    return _renumbered(np.where(labels == pair[1], pair[0], labels))
+
+
 def _merge_by_cost(patches: Patches, count: int) -> np.ndarray:
     """Merge neighbours whose union adds least to the error, until ``count`` parts are left. In each round, those pairs
     merge that are each other's best choice."""
@@ -228,12 +237,16 @@ def _merge_by_cost(patches: Patches, count: int) -> np.ndarray:
         moments, pairs = patches.moments.pooled(labels, parts), _neighbors(patches.edges, labels)
         if not len(pairs):
             break
-        errors = moments.errors()
         first, second = pairs.T
-        cost = moments.take(first).plus(moments.take(second)).errors() - errors[first] - errors[second]
-        order = np.lexsort((second, first, cost))
+        order = np.lexsort((second, first, _costs(moments, pairs)))
         labels = _merged(labels, pairs[order], parts - count)
     return labels
+
+
+def _costs(moments: Moments, pairs: np.ndarray) -> np.ndarray:
+    """Return what the union of each pair [E, 2] adds to the error, [E]."""
+    errors, (first, second) = moments.errors(), pairs.T
+    return moments.take(first).plus(moments.take(second)).errors() - errors[first] - errors[second]
 
 
 def _merged(labels: np.ndarray, pairs: np.ndarray, most: int) -> np.ndarray:

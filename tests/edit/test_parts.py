@@ -129,6 +129,37 @@ def test_bones_between_two_others_remain(cuts, joints, angles):
     assert same_partition(find_parts(patches), piece)
 
 
+def test_few_patches_go_where_their_motion_goes_however_they_turn(monkeypatch):
+    """The outermost patches, which also touch the part at rest, move with the other one but keep their orientation."""
+    patches, segment, _ = chain([60.0])
+    ends = np.array([18, 19])
+    moments = slid(patches.moments, ends)
+    edges = np.concatenate([patches.edges, [[5, 19]]])
+    first = np.where(np.isin(np.arange(20), ends), 2, segment)
+    monkeypatch.setattr(parts, "_merge_by_cost", lambda *_: first)
+    monkeypatch.setattr(parts, "MAX_ROUNDS", 0)
+    assert same_partition(find_parts(patches._replace(moments=moments, edges=edges)), segment)
+
+
+def slid(moments: Moments, rows: np.ndarray) -> Moments:
+    """Take the rotations about their centres out of the motion of some patches."""
+    found = Moments(*(each.copy() for each in moments))
+    count, rest, spread = moments.count[rows, None, None], moments.rest[rows, None], moments.spread[rows]
+    shift = moments.posed[rows] / count - rest / count
+    found.cross[rows] = spread[:, None] + shift[..., None] * rest[:, :, None]
+    found.squares[rows] = (
+        np.trace(spread, axis1=1, axis2=2)[:, None] + 2.0 * (shift * rest).sum(2) + count[..., 0] * (shift**2).sum(2)
+    )
+    return found
+
+
+def cost_of_union(moments: Moments, labels: np.ndarray, pair: np.ndarray) -> float:
+    """Return the error that one motion for both adds."""
+    bodies = [moments.take(np.flatnonzero(np.isin(labels, own))) for own in ([pair[0]], [pair[1]], list(pair))]
+    errors = [float(each.pooled(np.zeros(len(each.count), np.int64), 1).errors()[0]) for each in bodies]
+    return errors[2] - errors[0] - errors[1]
+
+
 def merged_plainly(patches: Patches) -> np.ndarray:
     """Merge as ``find_parts`` does, every round and every fit anew."""
     labels = parts._merge_by_cost(patches, parts.FIRST_PARTS)
@@ -137,12 +168,16 @@ def merged_plainly(patches: Patches) -> np.ndarray:
         if left > 0:
             labels = parts._refined(patches, labels, parts._Fits(patches.moments))
         pairs = parts._neighbors(patches.edges, labels)
+        small = [pair for pair in pairs if (np.bincount(labels)[pair] < least).any()]
+        if small:
+            first, second = min(small, key=lambda pair: cost_of_union(patches.moments, labels, pair))
+            labels = parts._renumbered(np.where(labels == second, first, labels))
+            continue
         turns = relative_turns(*fit_parts(patches.moments, labels), pairs)
         widths = np.array([plain_width(patches.edges, labels, pair) for pair in pairs])
-        small = (np.bincount(labels)[pairs] < least).any(1)
         limits = LEAST_TURN * np.minimum(1.0, np.maximum(widths, parts.NARROW_TURN))
-        best = int(np.where(small, turns - 2.0 * math.pi, turns / limits).argmin())
-        if turns[best] > limits[best] and not small[best]:
+        best = int((turns / limits).argmin())
+        if turns[best] > limits[best]:
             pooled, motions = fit_parts(patches.moments, labels)
             band = find_band(pooled, motions, pairs, partial(relative_turns, pooled, motions))
             if band is not None:
