@@ -31,11 +31,15 @@ from .run_folder import ReadOnlyRunFolder, RunFolder
 from .second_try import try_again
 from .state import StepResult, TrainState
 from .step import training_step
+from .vanishing import shows_nothing
 
 MOST_FAILURES = 20
 """Number of consecutive non-finite steps after which training stops at the last good state."""
 COMPARE_EVERY = 500
-"""Number of steps between two comparisons of the scenes that the processes of a group hold."""
+"""Number of steps between two comparisons of the scenes that the processes of a group hold, and between two checks that
+the scene is not empty."""
+MOST_EMPTY = 2
+"""Number of checks in a row that find the scene empty after which training stops."""
 
 
 def fit(
@@ -107,6 +111,7 @@ def fit(
             try:
                 check_replicas(state)
                 _train(state, frames, folder, test, bar, stop, watcher)
+                _refuse_empty(state, frames, folder)
             except ProcessLost as lost:
                 raise _process_lost(state, folder, lost) from lost
         state.motion.eval()
@@ -180,7 +185,7 @@ def _train(
     watcher: Watcher | None,
 ) -> None:
     config, noted, steps = state.config, False, steps_of(state, frames, bar.print)
-    saved_at = time.monotonic()
+    saved_at, empty = time.monotonic(), 0
     while state.step < config.steps:
         # 1. Enter the main stage when stage 1 is over.
         if state.stage == "pretrain" and state.step >= config.pretrain_steps:
@@ -228,6 +233,25 @@ def _train(
             saved_at = time.monotonic()
         if stopping:
             _stop(state, bar)
+        if state.step % COMPARE_EVERY == 0 and not last:
+            empty = empty + 1 if shows_nothing(state.scene(), frames.frames) else 0
+            if empty == MOST_EMPTY:
+                state.save(folder.path)
+                _refuse_empty(state, frames, folder)
+
+
+def _refuse_empty(state: TrainState, frames: Frames, folder: RunFolder) -> None:
+    """Refuse to go on, or to evaluate, when nothing is left of the scene.
+
+    Raises:
+        UserError: no view shows anything. The checkpoint is saved.
+    """
+    if shows_nothing(state.scene(), frames.frames):
+        raise UserError(
+            f"{folder.path}: nothing is left of the scene at step {state.step:,}: no training view shows any of its "
+            f"{len(state.gaussians):,} Gaussians; the checkpoint is kept; check cameras and focal lengths, or train "
+            "again with another --output and another --seed or more --steps"
+        )
 
 
 def _perhaps_again(

@@ -25,6 +25,7 @@ from .flow import Flow, FlowNumbers, flow_term, flow_weight
 from .frames import Frames, view_number
 from .silhouettes import SilhouetteSample, silhouette_term
 from .state import TrainState
+from .vanishing import recall
 
 VARIED_LATER = 4
 """Interval of the steps on a random background once most are on that of the data: enough to keep what lies beside the
@@ -179,6 +180,9 @@ def compare(
     loss, l1, ssim = photometric_loss(picture, view.truth, view.mask, config.loss.ssim, form.log_weight)
     if form.pooled:
         loss = loss + pooled_residual(picture, view.truth, view.mask)
+    recalled = recall(posed.means, alpha, l1)
+    if recalled is not None:
+        regulariser = recalled if regulariser is None else regulariser + recalled
     total = loss if regulariser is None else loss + regulariser
     return Compared(total, loss, l1, ssim, regulariser, picture)
 

@@ -1,0 +1,71 @@
+"""Scenes of which the views show nothing: drawn back while they train, recognised when nothing is left."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from ..data.dataset import Dataset, spread
+from ..errors import UserError
+from ..geometry.normalisation import COMMON_RADIUS
+from ..scene.scene import Scene
+
+RECALL = 0.2
+"""Weight of the distance by which Gaussians that a view does not show are drawn back: about as strong as the image loss
+draws all of them together."""
+LEAST_DIFFERENCE = 1e-4
+"""Difference from the truth above which an empty picture should show something."""
+VIEWS = 20
+"""Largest number of views in which something is sought."""
+
+
+def recall(means: Tensor, alpha: Tensor, l1: Tensor) -> Tensor | None:
+    """Draw back Gaussians of which a view shows none, although it should.
+
+    Nothing else would: what is not drawn has no gradient. Large steps of the motion, at the start or after an opacity
+    reset, can carry all of them behind the camera.
+
+    Args:
+        means: [N, 3] normalised.
+        alpha: [H, W] of the picture.
+        l1: scalar, difference between the picture and the truth.
+
+    Returns:
+        ``RECALL`` times the mean distance to the region that all cameras see, 0 where the view shows something; None
+        if that is known without waiting for a GPU.
+    """
+    lost = (alpha.detach().amax() == 0) & (l1.detach() > LEAST_DIFFERENCE)
+    if lost.device.type == "cpu" and not lost:
+        return None
+    far = means.detach().norm(dim=1)
+    chosen = (
+        lost & far.isfinite() & (far > COMMON_RADIUS)
+    )  # what is not chosen gets a gradient of 0, also if not finite
+    distances = torch.where(chosen[:, None], means, 0.0).norm(dim=1) - COMMON_RADIUS * chosen
+    return RECALL * distances.sum() / len(means)
+
+
+@torch.no_grad()
+def shows_nothing(scene: Scene, data: Dataset) -> bool:
+    """Return whether none of up to ``VIEWS`` training views shows anything of the scene, though their images do."""
+    sought, training = False, scene.motion.training
+    scene.motion.eval()
+    try:
+        for index in spread(len(data), VIEWS):
+            entry = data.entries[index]
+            if bool(scene.render(entry.camera, entry.time).alpha.any()):
+                return False
+            sought = sought or _has_content(data, index)
+    finally:
+        scene.motion.train(training)
+    return sought
+
+
+def _has_content(data: Dataset, index: int) -> bool:
+    """Return whether an image differs from the background; False if it is no longer readable."""
+    try:
+        frame = data[index]
+    except UserError:
+        return False
+    differs = (frame.image - data.background_color).abs().amax(2) > LEAST_DIFFERENCE
+    return bool((differs if frame.mask is None else differs & frame.mask).any())
