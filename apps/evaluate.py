@@ -66,6 +66,19 @@ def load_data(scene: Scene, options: Options) -> Dataset:
     return data.load(folder, options.split, **kept)
 
 
+def other_images(run: Path, dataset: Dataset) -> str | None:
+    """Say that the images are not those that the run recorded for this split, or return None."""
+    from scgs_warp.data.thumbnails import differ, thumbnails
+    from scgs_warp.storage import checkpoint
+
+    recorded = checkpoint.read(run, ())[1].get("images")
+    if not isinstance(recorded, dict) or not differ(recorded.get(dataset.split), thumbnails(dataset)):
+        return None
+    return (
+        f"{dataset.folder}: its {dataset.split} images are not those with which {run} was trained; scoring them anyway"
+    )
+
+
 def show(metrics: dict[str, Any], unfinished: str | None) -> None:
     """Print the metrics as a table."""
     from rich.console import Console
@@ -126,7 +139,8 @@ def main(args: list[str] | None) -> None:
 
         lpips = LPIPS(options.lpips_weights, device)
     dataset = load_data(scene, options)
-    print("\n".join(dataset.notes), end="\n" if dataset.notes else "")
+    notes = [*dataset.notes, *filter(None, [other_images(options.run, dataset)])]
+    print("\n".join(notes), end="\n" if notes else "")
     poses = "given"
     if options.split == "train":
         from scgs_warp.training.camera_refinement import refined

@@ -14,6 +14,7 @@ from torch import Tensor
 from ..config.presets import TrainConfig
 from ..config.validation import check
 from ..data.dataset import Dataset
+from ..data.thumbnails import thumbnails
 from ..errors import FrameError, UserError
 from ..runtime import environment
 from ..runtime.memory import NotEnoughMemory
@@ -31,7 +32,7 @@ from .run_folder import ReadOnlyRunFolder, RunFolder
 from .second_try import try_again
 from .state import StepResult, TrainState
 from .step import training_step
-from .vanishing import shows_nothing
+from .vanishing import refuse_empty, shows_nothing
 
 MOST_FAILURES = 20
 """Number of consecutive non-finite steps after which training stops at the last good state."""
@@ -100,6 +101,7 @@ def fit(
         # The first process may have to restore a checkpoint before the others read it.
         state = group.in_turn(open_state) if group is not None and resume else open_state()
         state.group = group
+        state.images = {split.split: thumbnails(split) for split in (data, test) if split is not None and len(split)}
         if resume and state.step == config.steps and (group is None or group.first):
             _end_here(state, folder)
         frames = Frames(data, state.normalisation, config, device, state.compared_stereo(data))
@@ -111,7 +113,7 @@ def fit(
             try:
                 check_replicas(state)
                 _train(state, frames, folder, test, bar, stop, watcher)
-                _refuse_empty(state, frames, folder)
+                refuse_empty(state, frames.frames, folder.path)
             except ProcessLost as lost:
                 raise _process_lost(state, folder, lost) from lost
         state.motion.eval()
@@ -237,21 +239,7 @@ def _train(
             empty = empty + 1 if shows_nothing(state.scene(), frames.frames) else 0
             if empty == MOST_EMPTY:
                 state.save(folder.path)
-                _refuse_empty(state, frames, folder)
-
-
-def _refuse_empty(state: TrainState, frames: Frames, folder: RunFolder) -> None:
-    """Refuse to go on, or to evaluate, when nothing is left of the scene.
-
-    Raises:
-        UserError: no view shows anything. The checkpoint is saved.
-    """
-    if shows_nothing(state.scene(), frames.frames):
-        raise UserError(
-            f"{folder.path}: nothing is left of the scene at step {state.step:,}: no training view shows any of its "
-            f"{len(state.gaussians):,} Gaussians; the checkpoint is kept; check cameras and focal lengths, or train "
-            "again with another --output and another --seed or more --steps"
-        )
+                refuse_empty(state, frames.frames, folder.path)
 
 
 def _perhaps_again(

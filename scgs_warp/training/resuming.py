@@ -7,6 +7,7 @@ from typing import Any
 
 from ..config.presets import FREE_TO_CHANGE, TrainConfig
 from ..data.dataset import Dataset
+from ..data.thumbnails import differ, thumbnails
 from ..errors import UserError
 from ..geometry.cameras import Overview, overview
 
@@ -28,7 +29,7 @@ def check_steps(step: int, config: TrainConfig, source: str) -> None:
 
 
 def check_same_frames(saved: dict[str, Any], data: Dataset, source: str) -> None:
-    """Refuse to continue on other frames, or on frames with other cameras.
+    """Refuse to continue on other frames, on frames with other cameras, or on other images.
 
     Args:
         saved: metadata of the checkpoint.
@@ -44,6 +45,12 @@ def check_same_frames(saved: dict[str, Any], data: Dataset, source: str) -> None
         raise UserError(
             f"{source}: made with other cameras than those of {data.folder}; restore them, or train again with "
             "another --output"
+        )
+    images = saved.get("images")
+    if isinstance(images, dict) and differ(images.get(data.split), thumbnails(data)):
+        raise UserError(
+            f"{source}: made from other images than those of {data.folder}, which have the same names; give the same "
+            "--data, or train again with another --output"
         )
 
 

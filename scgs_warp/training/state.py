@@ -104,6 +104,8 @@ class TrainState:
         self.failures = 0
         self.group: ProcessGroup | None = None
         """Processes that share each step's views; not part of a checkpoint."""
+        self.images: dict[str, str] = {}
+        """``thumbnails`` of the splits, for the checkpoint."""
         self.stereo: StereoDepths | None = None
         """Depth of the frames of a rig, if it has been found; not part of a checkpoint."""
         self.consistent = True
@@ -238,6 +240,7 @@ class TrainState:
             "extent": self.extent,
             "failures": self.failures,
             "frames": self.fingerprint,
+            "images": self.images,
         }
         checkpoint.write(folder, tensors, metadata)
 

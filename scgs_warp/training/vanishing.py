@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import torch
 from torch import Tensor
 
@@ -9,6 +11,7 @@ from ..data.dataset import Dataset, spread
 from ..errors import UserError
 from ..geometry.normalisation import COMMON_RADIUS
 from ..scene.scene import Scene
+from .state import TrainState
 
 RECALL = 0.2
 """Weight of the distance by which Gaussians that a view does not show are drawn back: about as strong as the image loss
@@ -43,6 +46,20 @@ def recall(means: Tensor, alpha: Tensor, l1: Tensor) -> Tensor | None:
     )  # what is not chosen gets a gradient of 0, also if not finite
     distances = torch.where(chosen[:, None], means, 0.0).norm(dim=1) - COMMON_RADIUS * chosen
     return RECALL * distances.sum() / len(means)
+
+
+def refuse_empty(state: TrainState, data: Dataset, folder: Path) -> None:
+    """Refuse to go on, or to evaluate, when nothing is left of the scene. The checkpoint must be saved.
+
+    Raises:
+        UserError: no view shows anything.
+    """
+    if shows_nothing(state.scene(), data):
+        raise UserError(
+            f"{folder}: nothing is left of the scene at step {state.step:,}: no training view shows any of its "
+            f"{len(state.gaussians):,} Gaussians; the checkpoint is kept; check cameras and focal lengths, or train "
+            "again with another --output and another --seed or more --steps"
+        )
 
 
 @torch.no_grad()

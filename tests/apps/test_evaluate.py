@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import json
+import shutil
+
+import cv2
+import numpy as np
 
 from helpers.app_runs import run_app
 
@@ -12,6 +16,21 @@ def test_evaluate(trained, tmp_path):
     done = run_app("evaluate", "--run", str(trained), "--json", str(path), "--device", "cpu")
     assert done.returncode == 0, done.stderr
     assert json.loads(path.read_text())["psnr"] == json.loads((trained / "metrics.json").read_text())["psnr"]
+
+
+def test_other_images_of_the_same_names_are_noted(dnerf, trained, tmp_path):
+    other = tmp_path / "other"
+    shutil.copytree(dnerf, other)
+    where = "--run", str(trained), "--json", str(tmp_path / "m.json"), "--data", str(other), "--device", "cpu"
+    assert "are not those" not in run_app("evaluate", *where).stdout
+    for path in (other / "test").glob("*.png"):
+        pixels = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+        cv2.imwrite(str(path), np.ascontiguousarray(pixels[::-1]))
+    done = run_app("evaluate", *where)
+    assert done.returncode == 0, done.stderr
+    assert (
+        f"{other}: its test images are not those with which {trained} was trained; scoring them anyway" in done.stdout
+    )
 
 
 def test_a_folder_without_a_run(tmp_path):

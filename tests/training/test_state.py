@@ -61,6 +61,25 @@ def test_resume_refuses_other_cameras(change, tmp_path):
     fit(config, data, output=tmp_path / "run", resume=True)
 
 
+def test_resume_refuses_other_images_of_the_same_names(tmp_path):
+    config, data = tiny_config(20), tiny_dataset(6)
+    fit(config, data, output=tmp_path / "run")
+    frames = [dataclasses.replace(frame, image=frame.image.flip(1)) for frame in data]
+    with pytest.raises(UserError, match="other images than those of tiny, which have the same names; give the same"):
+        fit(config, type(data)(frames, folder=data.folder, split="train"), output=tmp_path / "run", resume=True)
+    moved = type(data)(list(data), folder=Path("elsewhere"), split="train")
+    fit(config, moved, output=tmp_path / "run", resume=True)
+
+
+def test_runs_without_thumbnails_are_resumed(tmp_path):
+    config, data = tiny_config(20), tiny_dataset(6)
+    fit(config, data, output=tmp_path / "run")
+    tensors, metadata = checkpoint.read(tmp_path / "run")
+    del metadata["images"], metadata["crc32"]
+    checkpoint.write(tmp_path / "run", tensors, metadata)
+    fit(config, data, output=tmp_path / "run", resume=True)
+
+
 def test_resume_names_settings_of_the_data_before_the_frames(tmp_path):
     config = tiny_config(20)
     fit(config, tiny_dataset(3), output=tmp_path / "run")

@@ -11,7 +11,7 @@ from helpers.tiny import tiny_config, tiny_dataset
 from scgs_warp.errors import UserError
 from scgs_warp.geometry.normalisation import COMMON_RADIUS
 from scgs_warp.scene.scene import Scene
-from scgs_warp.training import loop
+from scgs_warp.training import loop, vanishing
 from scgs_warp.training.frames import Frames
 from scgs_warp.training.loop import fit
 from scgs_warp.training.state import TrainState
@@ -56,7 +56,8 @@ def test_a_view_that_shows_something_or_should_be_empty_draws_nothing_back(alpha
 
 
 def test_training_ends_where_nothing_is_left(tmp_path, monkeypatch):
-    monkeypatch.setattr(loop, "shows_nothing", lambda scene, data: True)
+    for module in (loop, vanishing):
+        monkeypatch.setattr(module, "shows_nothing", lambda scene, data: True)
     monkeypatch.setattr(loop, "COMPARE_EVERY", 10)
     with pytest.raises(UserError, match=r"nothing is left of the scene at step 20\b.*the checkpoint is kept"):
         fit(tiny_config(100), tiny_dataset(4), output=tmp_path / "run")
@@ -64,7 +65,7 @@ def test_training_ends_where_nothing_is_left(tmp_path, monkeypatch):
 
 
 def test_a_scene_that_is_empty_at_the_end_is_not_evaluated(tmp_path, monkeypatch):
-    monkeypatch.setattr(loop, "shows_nothing", lambda scene, data: True)
+    monkeypatch.setattr(vanishing, "shows_nothing", lambda scene, data: True)
     for resume in (False, True):
         with pytest.raises(UserError, match="nothing is left of the scene at step 20"):
             fit(tiny_config(20), tiny_dataset(4), output=tmp_path / "run", resume=resume)
