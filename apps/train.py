@@ -80,10 +80,9 @@ GROUPS = {"usual": Usual, "image": ImageChoice, "model": Model, "machine": Host}
 """Groups of options in ``--help``: what people use first comes first."""
 
 
-def default_output(options: Options) -> Path:
-    """Return runs/NAME-PRESET, with the name of the data folder."""
-    name = (options.data or BUILTIN).resolve().name
-    return RUNS / f"{name}-{options.preset or ('cpu' if options.data else 'quick')}"
+def default_output(folder: Path | None, preset: str) -> Path:
+    """Return runs/NAME-PRESET, with the name of the data folder; None stands for the built-in scene."""
+    return RUNS / f"{(folder or BUILTIN).resolve().name}-{preset}"
 
 
 def live_view(options: Options, output: Path, steps: int) -> TrainingView:
@@ -109,13 +108,14 @@ def main(args: list[str] | None) -> None:
     where = process_rank()
     threads = where.threads if where and options.threads is None else options.threads
     device = prepare(options.device, threads, options.memory_gib)
-    output = options.output or default_output(options)
-    recorded = output / "config.json"
-    file = options.config or (recorded if options.resume and recorded.is_file() else None)
-    flags = {"motion.model": options.motion, "seed": options.seed}
     usual = "cpu" if options.data else None
-    resumed = options.resume and file is recorded
+    recorded = (options.output or default_output(options.data, options.preset or usual or "quick")) / "config.json"
+    resumed = options.resume and options.config is None and recorded.is_file()
+    file = recorded if resumed else options.config
+    flags = {"motion.model": options.motion, "seed": options.seed}
     config, named = configuration(options, file, flags, usual, where.size if where else 1, resumed)
+    folder = options.data or (Path(named) if named else None)
+    output = options.output or (recorded.parent if resumed else default_output(folder, config.preset))
 
     from scgs_warp.runtime.progress import say
     from scgs_warp.runtime.provenance import command_line
@@ -135,7 +135,6 @@ def main(args: list[str] | None) -> None:
         say("\n".join(advise(survey(data), config, device)))
 
     with join_processes(where, device) as group:
-        folder = options.data or (Path(named) if named else None)
         if folder is None:  # Only one of several processes makes it.
             folder = group.in_turn(lambda: builtin_scene(device)) if group else builtin_scene(device)
         rest = {"device": device, "resume": options.resume, "tensorboard": options.tensorboard, "group": group}

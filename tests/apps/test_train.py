@@ -40,6 +40,18 @@ def test_its_config_can_be_given_back(trained, tmp_path):
     assert first == second
 
 
+def test_the_default_output_is_named_after_what_the_configuration_names(trained, tmp_path, monkeypatch):
+    """Not after the built-in scene, whose run it would stand in for."""
+    monkeypatch.chdir(tmp_path)
+    content = json.loads((trained / "config.json").read_text())
+    (tmp_path / "part.json").write_text(json.dumps({"preset": content["preset"], "data": content["data"]}))
+    for file in (trained / "config.json", tmp_path / "part.json"):
+        done = run_app("train", "--config", str(file), "--steps", "20", *SMALL)
+        assert done.returncode == 0, done.stderr
+        assert f"runs/blobs-{content['preset']}: metrics.json" in done.stderr + done.stdout
+        shutil.rmtree("runs")
+
+
 def test_interrupted_from_the_terminal_and_resumed(dnerf, tmp_path):
     output = tmp_path / "run"
     options = ["--data", str(dnerf), "--output", str(output), "--steps", "4000", *SMALL]
