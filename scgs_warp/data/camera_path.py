@@ -14,7 +14,7 @@ from ..errors import UserError
 from ..geometry.cameras import Overview, image_size
 from ..storage.json_files import as_array, as_number, read_json
 from ..types import Camera
-from .readers.transforms import read_pose
+from .readers.transforms import read_intrinsics, read_pose
 
 MOST_CAMERAS = 100_000
 FARTHEST = 1e9
@@ -32,6 +32,10 @@ class PathCamera(NamedTuple):
     """Vertical field of view in radians."""
     time: float | None
     """Time in [0, 1]; None if the path does not say."""
+    stretch: float = 1.0
+    """Focal length across divided by that upwards."""
+    centre: tuple[float, float] = (0.5, 0.5)
+    """Principal point, as shares of the picture's width and height."""
 
 
 class CameraPath(NamedTuple):
@@ -51,16 +55,16 @@ class CameraPath(NamedTuple):
         chosen = self.cameras if frames is None else resampled(self.cameras, frames)
         width, height = image_size(Overview((0, 0, 0), (0, 0, 1), 1.0, 60.0, 0.0, aspect=self.aspect), size)
         made = []
-        for viewmat, fov, time in chosen:
+        for viewmat, fov, time, stretch, (across, down) in chosen:
             focal = 0.5 * height / math.tan(0.5 * fov)
-            K = torch.tensor([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]])
+            K = torch.tensor([[focal * stretch, 0.0, across * width], [0.0, focal, down * height], [0.0, 0.0, 1.0]])
             made.append((Camera(torch.from_numpy(viewmat).float(), K, width, height), time))
         return made
 
 
 def resampled(cameras: list[PathCamera], count: int) -> list[PathCamera]:
-    """Interpolate ``count`` cameras along a path: positions, fields of view and times linearly, rotations on the
-    shortest arc."""
+    """Interpolate ``count`` cameras along a path: positions, intrinsics and times linearly, rotations on the shortest
+    arc."""
     if len(cameras) == 1:
         return cameras * count
     knots, wanted = np.arange(len(cameras)), np.linspace(0.0, len(cameras) - 1.0, count)
@@ -68,6 +72,8 @@ def resampled(cameras: list[PathCamera], count: int) -> list[PathCamera]:
     turns = Slerp(knots, Rotation.from_matrix(poses[:, :3, :3]))(wanted).as_matrix()
     places = np.stack([np.interp(wanted, knots, poses[:, axis, 3]) for axis in range(3)], axis=1)
     fovs = np.interp(wanted, knots, [camera.fov for camera in cameras])
+    stretches = np.interp(wanted, knots, [camera.stretch for camera in cameras])
+    centres = [np.interp(wanted, knots, [camera.centre[axis] for camera in cameras]) for axis in range(2)]
     given = [camera.time for camera in cameras]
     times = None if None in given else np.interp(wanted, knots, np.array(given, np.float64))
     made = []
@@ -75,7 +81,8 @@ def resampled(cameras: list[PathCamera], count: int) -> list[PathCamera]:
         pose = np.eye(4)
         pose[:3, :3], pose[:3, 3] = turns[index], places[index]
         time = None if times is None else float(times[index])
-        made.append(PathCamera(np.linalg.inv(pose), float(fovs[index]), time))
+        centre = float(centres[0][index]), float(centres[1][index])
+        made.append(PathCamera(np.linalg.inv(pose), float(fovs[index]), time, float(stretches[index]), centre))
     return made
 
 
@@ -156,17 +163,20 @@ def _frame(
 ) -> PathCamera:
     where = f"{path}: frames[{index}]"
     fields = {**content, **entry}
-    viewmat = read_pose(path, index, entry)
-    if "fl_x" in fields and "w" in fields:
-        focal, width = as_number(fields["fl_x"]), as_number(fields["w"])
-        if focal is None or width is None or focal <= 0 or width < 1:
-            raise UserError(f"{where}: fl_x or w is not a positive number; give both in pixels")
-        across = 2.0 * math.atan(0.5 * width / focal)
-    elif "camera_angle_x" in fields:
+    viewmat, time = read_pose(path, index, entry), _time(where, entry)
+    if "w" in fields and ("fl_x" in fields or "camera_angle_x" in fields):
+        width = as_number(fields["w"])
+        height = as_number(fields["h"]) if "h" in fields else width and width / aspect
+        if width is None or height is None or width < 1 or height < 1:
+            raise UserError(f"{where}: w or h is no size in pixels; correct both")
+        fx, fy, cx, cy = read_intrinsics(path, fields, index, (width, height))
+        shown = width / aspect  # the film's height in pixels of the frame, whose proportions may be others
+        centre = cx / width, 0.5 + (cy - 0.5 * height) / shown
+        return _checked(where, PathCamera(viewmat, 2.0 * math.atan(0.5 * shown / fy), time, fx / fy, centre))
+    across = math.radians(overview.fov_x)
+    if "camera_angle_x" in fields:
         across = _fov(f"{path}: camera_angle_x", fields["camera_angle_x"], False)
-    else:
-        across = math.radians(overview.fov_x)
-    return _checked(where, PathCamera(viewmat, 2.0 * math.atan(math.tan(across / 2.0) / aspect), _time(where, entry)))
+    return _checked(where, PathCamera(viewmat, 2.0 * math.atan(math.tan(across / 2.0) / aspect), time))
 
 
 def _checked(where: str, camera: PathCamera) -> PathCamera:

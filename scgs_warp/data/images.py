@@ -50,7 +50,7 @@ T = TypeVar("T")
 R = TypeVar("R")
 
 
-def size_text(size: Sequence[int]) -> str:
+def size_text(size: Sequence[float]) -> str:
     """Format (width, height) as ``800 x 600 pixels``."""
     return f"{size[0]} x {size[1]} pixels"
 

@@ -125,7 +125,7 @@ class _Renders:
             raise UserError(f"{path}: cannot be written ({error.strerror}); free space there") from None
 
 
-def _distinct(names: list[str]) -> list[str]:
+def distinct_names(names: list[str]) -> list[str]:
     """Return names for files, one per frame: that of the frame, with the frame's number if an earlier one has it."""
     found: dict[str, None] = {}
     for index, name in enumerate(names):
@@ -177,7 +177,7 @@ def evaluate(
     background = dataset.background_color
     renders = None if render_dir is None else _Renders(Path(render_dir), len(dataset), tuple(background.tolist()))
     rows: list[dict[str, Any]] = []
-    names = _distinct([entry.name for entry in dataset.entries])
+    names = distinct_names([entry.name for entry in dataset.entries])
     for index, frame in enumerate(dataset):
         rendered = scene.render(frame.camera, frame.time, background)
         image = rendered.rgb.clamp(0.0, 1.0)

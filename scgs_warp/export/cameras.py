@@ -11,13 +11,14 @@ import numpy as np
 
 from ..data.dataset import Dataset
 from ..data.readers.transforms import OPENGL_TO_OPENCV
+from ..evaluation.evaluate import distinct_names
 from ..storage.files import write_atomically
 from ..types import Camera
 
 
 def write_cameras(path: Path, splits: Mapping[str, Dataset]) -> int:
     """Write poses (camera-to-world, OpenGL), intrinsics in pixels and times in [0, 1]. Images are not copied;
-    ``file_path`` is ``SPLIT/NAME.png``.
+    ``file_path`` is ``SPLIT/NAME.png``, where names that repeat, as in the folders of a rig, get the frame's number.
 
     Args:
         splits: data sets by the names of their splits, with cameras as used in training: world units, after downscaling
@@ -31,10 +32,10 @@ def write_cameras(path: Path, splits: Mapping[str, Dataset]) -> int:
     """
     entries, lists = [], {}
     for split, data in splits.items():
-        lists[f"{split}_filenames"] = names = []
-        for entry in data.entries:
-            names.append(f"{split}/{entry.name}.png")
-            entries.append({"file_path": names[-1], **_fields(entry.camera), "time": entry.time})
+        names = [f"{split}/{name}.png" for name in distinct_names([entry.name for entry in data.entries])]
+        lists[f"{split}_filenames"] = names
+        for name, entry in zip(names, data.entries):
+            entries.append({"file_path": name, **_fields(entry.camera), "time": entry.time})
     content = {"camera_model": "PINHOLE", "frames": entries, **lists}
     shared = ("w", "h", "fl_x", "fl_y", "cx", "cy")
     if entries and all(all(entry[key] == entries[0][key] for key in shared) for entry in entries):

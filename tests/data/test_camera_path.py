@@ -58,6 +58,46 @@ def test_frames_of_a_data_set(tmp_path):
         assert (camera.width, camera.height) == (WIDTH, HEIGHT) and float(camera.K[0, 0]) == pytest.approx(FOCAL)
 
 
+def test_the_lens_of_each_frame_is_followed(tmp_path):
+    """A principal point beside the middle, and pixels that are not square, at another size."""
+    write(tmp_path, 3)
+    content = json.loads((tmp_path / "transforms.json").read_text())
+    content.update(fl_x=50.0, fl_y=75.0, w=WIDTH, h=HEIGHT, cx=0.25 * WIDTH, cy=0.75 * HEIGHT)
+    content["frames"][1].update(fl_x=60.0, cx=0.5 * WIDTH)
+    (tmp_path / "path.json").write_text(json.dumps(content))
+    path = read_camera_path(tmp_path / "path.json", OVERVIEW)
+    for frames in (None, 3):
+        (first, _), (second, _), _ = path.film(frames, 2 * WIDTH)
+        assert (first.width, first.height) == (2 * WIDTH, 2 * HEIGHT)
+        numbers = [float(K[i, j]) for K in (first.K, second.K) for i, j in ((0, 0), (1, 1), (0, 2), (1, 2))]
+        middle = 1.5 * HEIGHT
+        assert numbers == pytest.approx([100.0, 150.0, 0.5 * WIDTH, middle, 120.0, 150.0, WIDTH, middle], rel=1e-5)
+    halfway, _ = path.film(5, WIDTH)[1]
+    assert float(halfway.K[0, 2]) == pytest.approx(0.375 * WIDTH, rel=1e-5)
+
+
+def test_frames_of_other_proportions_keep_their_width(tmp_path):
+    write(tmp_path, 2)
+    content = json.loads((tmp_path / "transforms.json").read_text())
+    content.update(fl_x=50.0, fl_y=50.0, w=100, h=50, cx=50.0, cy=25.0)
+    content["frames"][1].update(w=50, h=100, cx=25.0, cy=40.0)
+    (tmp_path / "path.json").write_text(json.dumps(content))
+    _, (upright, _) = read_camera_path(tmp_path / "path.json", OVERVIEW).film(None, 100)
+    expected = [[100.0, 0.0, 50.0], [0.0, 100.0, 5.0], [0.0, 0.0, 1.0]]
+    np.testing.assert_allclose(upright.K.numpy(), expected, rtol=1e-5)
+
+
+@pytest.mark.parametrize(("field", "value"), [("w", 0), ("h", "tall"), ("fl_y", -5), ("cx", "middle")])
+def test_faults_of_a_lens_are_named(field, value, tmp_path):
+    write(tmp_path, 2)
+    content = json.loads((tmp_path / "transforms.json").read_text())
+    content["frames"][1].update(fl_x=50.0, w=WIDTH, h=HEIGHT)
+    content["frames"][1][field] = value
+    (tmp_path / "path.json").write_text(json.dumps(content))
+    with pytest.raises(UserError, match=rf"path\.json: .*\b{field}\b"):
+        read_camera_path(tmp_path / "path.json", OVERVIEW)
+
+
 def test_interpolation_keeps_the_given_cameras(tmp_path):
     path = read_camera_path(nerfstudio(tmp_path), OVERVIEW)
     film = path.film(5, 120)

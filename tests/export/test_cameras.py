@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 
 import torch
 
 from scgs_warp.data import load
+from scgs_warp.data.dataset import Dataset
 from scgs_warp.export.cameras import write_cameras
 
 
@@ -34,3 +36,13 @@ def test_cameras_are_read_back(tmp_path):
             assert ours.time == theirs.time and ours.name == theirs.name
             torch.testing.assert_close(ours.camera.viewmat, theirs.camera.viewmat, atol=1e-6, rtol=0)
             torch.testing.assert_close(ours.camera.K, theirs.camera.K)
+
+
+def test_frames_of_one_name_in_the_folders_of_a_rig_are_told_apart(tmp_path):
+    from helpers.tiny import tiny_dataset
+
+    frames = [dataclasses.replace(frame, name=f"{index % 2:04d}") for index, frame in enumerate(tiny_dataset(4))]
+    write_cameras(tmp_path / "transforms.json", {"train": Dataset(frames, folder=tmp_path, split="train")})
+    content = json.loads((tmp_path / "transforms.json").read_text())
+    names = ["train/0000.png", "train/0001.png", "train/0000_00002.png", "train/0001_00003.png"]
+    assert content["train_filenames"] == names == [frame["file_path"] for frame in content["frames"]]

@@ -207,7 +207,7 @@ def read_lens(path: Path, fields: dict[str, Any], index: int, source: tuple[int,
 
 
 def read_intrinsics(
-    path: Path, fields: dict[str, Any], index: int, source: tuple[int, int]
+    path: Path, fields: dict[str, Any], index: int, source: tuple[float, float]
 ) -> tuple[float, float, float, float]:
     """Return (fx, fy, cx, cy) in pixels of the file's full size."""
 
@@ -250,7 +250,7 @@ def read_intrinsics(
 
 
 def _check_units(
-    path: Path, index: int, intrinsics: tuple[float, float, float, float], source: tuple[int, int]
+    path: Path, index: int, intrinsics: tuple[float, float, float, float], source: tuple[float, float]
 ) -> None:
     """Refuse intrinsics in shares of the image's size, or of images of another size: cameras would see next to
     nothing.
