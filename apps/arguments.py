@@ -68,6 +68,22 @@ def parse(
     return kind(**values)
 
 
+def refuse_given(options: Any, names: Sequence[str], why: str) -> None:
+    """Refuse options that would have no effect.
+
+    Args:
+        options: dataclass of the options.
+        names: those that must keep their defaults.
+        why: what they belong to, and the remedy.
+
+    Raises:
+        UserError: names the first option that has another value.
+    """
+    for item in dataclasses.fields(options):
+        if item.name in names and getattr(options, item.name) != item.default:
+            raise UserError(f"--{item.name.replace('_', '-')}: {why}")
+
+
 @contextlib.contextmanager
 def one_line_errors(name: str, words: Sequence[str], *kinds: type) -> Iterator[None]:
     """Turn the errors that tyro prints into a UserError.

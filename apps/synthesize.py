@@ -7,7 +7,7 @@ from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Literal
 
-from scgs_warp.apps.arguments import parse
+from scgs_warp.apps.arguments import parse, refuse_given
 from scgs_warp.apps.cli import Device, prepare, run
 
 
@@ -112,8 +112,34 @@ class Options(FilmOptions, Output):
     """CPU threads; all cores by default."""
 
 
+OF_IMAGES = ("clip", "start", "end", "train", "val", "cameras", "turns", "elevation", "background", "light", "ambient",
+             "diffuse", "unlit")  # fmt: skip
+"""Options that a film does not have."""
+
+
+def check_unused(options: Options) -> None:
+    """Refuse options that would have no effect.
+
+    Raises:
+        UserError: names the option, and what it belongs to.
+    """
+    from scgs_warp.errors import UserError
+
+    if options.film is None:
+        refuse_given(options, [field.name for field in fields(FilmOptions)], "belongs to a film; give --film, too")
+        return
+    if options.mesh is not None:
+        raise UserError(f"--mesh {options.mesh}: --film shows a built-in subject; give --subject, or leave out --film")
+    refuse_given(options, OF_IMAGES, "belongs to images; leave it out with --film")
+    if options.film == "rig":
+        refuse_given(options, ("shake", "test"), "belongs to --film phone; leave it out for a rig")
+    elif options.views != 1 or options.offsets:
+        refuse_given(options, ("offsets", "views"), "belongs to --film rig; leave it out for a phone")
+
+
 def main(args: list[str] | None) -> None:
     options = parse(Options, "synthesize", args)
+    check_unused(options)
     device = prepare(options.device, options.threads)
 
     from scgs_warp.errors import UserError
@@ -122,8 +148,6 @@ def main(args: list[str] | None) -> None:
         raise UserError(f"--size {' '.join(map(str, options.size))}: give one number, or width and height")
     if options.film is None:
         _render(options, device)
-    elif options.mesh is not None:
-        raise UserError(f"--mesh {options.mesh}: --film shows a built-in subject; give --subject, or leave out --film")
     else:
         _film(options, options.film, device)
 

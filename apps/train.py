@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from scgs_warp.apps.arguments import parse
+from scgs_warp.apps.arguments import parse, refuse_given
 from scgs_warp.apps.cli import prepare, run
 from scgs_warp.apps.settings import (
     BUILTIN,
@@ -105,6 +105,8 @@ def live_view(options: Options, output: Path, steps: int) -> TrainingView:
 
 def main(args: list[str] | None) -> None:
     options = parse(Options, "train", args, groups=GROUPS)
+    if not options.live:
+        refuse_given(options, ("port",), "belongs to --live; give both, or neither")
     where = process_rank()
     threads = where.threads if where and options.threads is None else options.threads
     device = prepare(options.device, threads, options.memory_gib)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Literal
 
 import tyro
 
-from scgs_warp.apps.arguments import parse
+from scgs_warp.apps.arguments import parse, refuse_given
 from scgs_warp.apps.cli import Device, prepare, run
 from scgs_warp.geometry.axes import Axis
 
@@ -20,6 +20,8 @@ if TYPE_CHECKING:
 LARGEST_SIDE = 8192
 FRAMES = 120
 """Default frame count of a film."""
+OF_FILMS = ("mode", "show", "frames", "size", "fps", "time", "frame", "target", "zoom", "path")
+"""Options that the page in the browser does not have."""
 
 
 @dataclass(frozen=True)
@@ -96,13 +98,13 @@ def check(options: Options) -> None:
     if options.live:
         if options.output is not None:
             raise UserError("--live shows the scene in the browser and writes nothing; leave --output out")
+        refuse_given(options, OF_FILMS, "belongs to a film; leave it out with --live")
         if not 0 <= options.port <= 65535:
             raise UserError(f"--port {options.port}: give 1 to 65535, or 0 for any")
         return
     if options.output is None:
         raise UserError("--output is missing: name a film (.mp4 or .gif) or a folder for PNGs, or give --live")
-    if options.share:
-        raise UserError("--share: belongs to --live; leave it out for a film")
+    refuse_given(options, ("port", "share"), "belongs to --live; leave it out for a film")
     if options.frames is not None and options.frames < 1:
         raise UserError(f"--frames {options.frames}: a film needs at least 1")
     if options.path is not None and (options.target is not None or options.frame != "auto" or options.zoom != 1.0):

@@ -293,11 +293,10 @@ def _help(facts: Survey, config: TrainConfig, device: str) -> str:
         )
     if facts.flicker > UNSTEADY and config.optim.frame_colors == 0.0:
         return "--set optim.frame_colors=2e-3 gives each frame its own exposure and white balance"
-    if config.steps < FEW_VISITS * facts.frames:
-        wanted = math.ceil(FEW_VISITS * facts.frames / 1000) * 1000
-        return (
-            f"each frame is seen {config.steps / facts.frames:.0f} times only: --steps {wanted} sees all of them enough"
-        )
+    visits = config.steps * config.batch / facts.frames
+    if visits < FEW_VISITS:
+        wanted = math.ceil(FEW_VISITS * facts.frames / config.batch / 1000) * 1000
+        return f"each frame is seen {visits:.0f} times only: --steps {wanted} sees all of them enough"
     if facts.points < FEWEST_POINTS and not facts.cut_out:
         return "COLMAP's points (ply_file_path, or its sparse model) begin some 2 dB better than random ones"
     if not facts.cut_out and facts.views == 1 and not facts.standing and config.optim.cameras == 0.0:

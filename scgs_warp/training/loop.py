@@ -102,6 +102,8 @@ def fit(
         state = group.in_turn(open_state) if group is not None and resume else open_state()
         state.group = group
         state.images = {split.split: thumbnails(split) for split in (data, test) if split is not None and len(split)}
+        if config.loss.flow > state.config.loss.flow:
+            folder.tell("loss.flow has no effect: frames that follow each other show too different things")
         if resume and state.step == config.steps and (group is None or group.first):
             _end_here(state, folder)
         frames = Frames(data, state.normalisation, config, device, state.compared_stereo(data))

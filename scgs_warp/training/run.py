@@ -60,7 +60,12 @@ def load_splits(config: TrainConfig, folder: Path) -> tuple[Dataset, Dataset]:
             return load(folder, split, **options, cache=cache, progress=show)
 
     train, test = read("train"), read("test")
-    for note in dict.fromkeys([*train.notes, *test.notes]):
+    notes, count = [*train.notes, *test.notes], len(train) + len(test)
+    if config.data.min_frames > count:
+        notes.append(
+            f"{folder}: has {count} frames, none without an image; min_frames {config.data.min_frames} has no effect"
+        )
+    for note in dict.fromkeys(notes):
         say(note)
     return train, test
 

@@ -25,6 +25,17 @@ CASES = {
     "train --steps": "error: --steps: give a value after it; 'scgs-warp train --help' lists the options",
     "bench frame --motions x": "error: --motions: no such option; did you mean --motion?; 'scgs-warp bench --help'",
     "capture film.mp4": "error: --output is missing: ",
+    "train --port 9000": "error: --port: belongs to --live; give both, or neither",
+    "view --run x --live --size 400": "error: --size: belongs to a film; leave it out with --live",
+    "view --run x --live --path p.json": "error: --path: belongs to a film; leave it out with --live",
+    "view --run x --output f.mp4 --port 9000": "error: --port: belongs to --live; leave it out for a film",
+    "view --run x --output f.mp4 --share": "error: --share: belongs to --live; leave it out for a film",
+    "synthesize --output x --seconds 3": "error: --seconds: belongs to a film; give --film, too",
+    "synthesize --output x --maps": "error: --maps: belongs to a film; give --film, too",
+    "synthesize --output x --film phone --train 9": "error: --train: belongs to images; leave it out with --film",
+    "synthesize --output x --film phone --views 3": "error: --views: belongs to --film rig; leave it out for a phone",
+    "synthesize --output x --film rig --shake 2": "error: --shake: belongs to --film phone; leave it out for a rig",
+    "synthesize --output x --film rig --mesh m.glb": "error: --mesh m.glb: --film shows a built-in subject",
 }
 
 

@@ -13,7 +13,7 @@ import tyro
 from helpers.handheld import handheld
 from helpers.layouts import write_colmap, write_poses_bounds
 from helpers.tiny import tiny_dataset, write_dnerf
-from scgs_warp.config.presets import MOTIONS, PRESETS, preset
+from scgs_warp.config.presets import MOTIONS, PRESETS, preset, with_steps
 from scgs_warp.data import Dataset, load
 from scgs_warp.training.dataset_advice import Survey, advise, looks_away, survey
 from scgs_warp.training.state import resolve_auto
@@ -101,6 +101,14 @@ def test_a_rig(own_moments):
     assert advise(dataclasses.replace(found, points=5000), config)[1].endswith("; the settings fit")
     film = dataclasses.replace(survey(handheld(41, 2.0)), points=5000)
     assert "optim.cameras" in advise(film, config)[1]
+
+
+def test_a_batch_sees_frames_more_often():
+    facts = dataclasses.replace(survey(handheld(41, 2.0)), points=5000)
+    config = with_steps(preset("cpu"), 200)
+    assert "each frame is seen 5 times only: --steps 1000" in advise(facts, config)[1]
+    assert "each frame is seen" not in advise(facts, dataclasses.replace(config, batch=8))[1]
+    assert "--steps 10000" in advise(dataclasses.replace(facts, frames=1000), dataclasses.replace(config, batch=2))[1]
 
 
 def test_what_is_no_rig():

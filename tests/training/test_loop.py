@@ -67,6 +67,13 @@ def test_the_log_shows_the_regulariser(batch, tmp_path, monkeypatch):
     assert sum(value > 0.0 for value in values) <= 20
 
 
+@pytest.mark.parametrize(("weight", "noted"), [(1.0, True), (0.0, False)])
+def test_flow_without_effect_is_noted(weight, noted, tmp_path, capsys):
+    fit(tiny_config(20, loss={"flow": weight}), tiny_dataset(4), output=tmp_path / "run")
+    said = capsys.readouterr()
+    assert ("loss.flow has no effect" in said.out + said.err) is noted
+
+
 def test_the_curve_does_not_show_opacity_resets(tmp_path, monkeypatch):
     """They fall on the same round steps."""
     looks = []

@@ -18,3 +18,15 @@ def test_long_reading_shows_how_far_it_is(tmp_path, monkeypatch, capsys):
     run.load_splits(config, tmp_path)
     said = capsys.readouterr()
     assert "reading train images" in said.out + said.err and "reading test images 2/2" in said.out + said.err
+
+
+def test_a_number_of_frames_that_there_are_not_is_noted(tmp_path, capsys):
+    from scgs_warp.training import run
+
+    write(tmp_path)
+    count = sum(len(split) for split in run.load_splits(tiny_config(20), tmp_path))
+    for least in (count, count + 1):
+        run.load_splits(tiny_config(20, data={"min_frames": least}), tmp_path)
+        said = capsys.readouterr()
+        note = f"has {count} frames, none without an image; min_frames {least} has no effect"
+        assert (note in said.out + said.err) is (least > count)
