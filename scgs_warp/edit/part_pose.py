@@ -170,6 +170,7 @@ class PartPoser:
         motions, body = self.motions(moves, now)
         if max(body) < 0:
             return []
+        handles = {self.rows[move.handle.part or ""]: move.handle for move in moves}
         of_node, goals = np.array(body)[self.owner], []
         held, short = self._held_nodes(body)
         for label in sorted(set(body)):
@@ -179,7 +180,7 @@ class PartPoser:
             goal = _goal(nodes, motions[label] if label >= 0 else Rigid.none(), now)
             if label in short and self._carries(label, body):
                 goal = goal._replace(stiffness=INNER_STIFFNESS, gives_rotation=False)
-            goals.append(goal)
+            goals.append(_as_asked(goal, handles[label]) if label >= 0 else goal)
         return goals
 
     def _carries(self, label: int, body: Sequence[int]) -> bool:
@@ -207,6 +208,14 @@ class PartPoser:
                 self._held.clear()
             found = self._held[key] = held, frozenset(short)
         return found
+
+
+def _as_asked(goal: Goal, handle: Handle) -> Goal:
+    """Return the goal of the body that a handle turns, with the handle's stiffness and turns where it states them."""
+    stiffness = goal.stiffness if handle.stiffness is None else handle.stiffness
+    return goal._replace(
+        stiffness=stiffness, gives_rotation=goal.gives_rotation if handle.turns is None else handle.turns
+    )
 
 
 def _goal(nodes: np.ndarray, motion: Rigid, now: np.ndarray) -> Goal:

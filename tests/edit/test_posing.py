@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 from scipy.sparse.csgraph import connected_components, shortest_path
@@ -193,6 +195,24 @@ def test_a_short_body_between_two_others_is_pulled_not_held(session):
     found = stiffness()
     assert found.pop("shoulder_left") == INNER_STIFFNESS
     assert "elbow_left" in found and set(found.values()) == {None}
+
+
+def test_a_part_is_held_as_its_handle_asks(session):
+    """The softer it is pulled, the less it is turned; firm, it is where it is without a stiffness."""
+    session.pose_part("elbow_left")
+    session.turn("elbow_left", 60, (1, 0, 0))
+    nodes, (handle,) = furthest(session, "elbow_left"), session.edit.handles
+    start, firm = (session.engine.to_world(session.engine.motion_at(0.0).positions), session.node_positions(0.0))
+    way = np.linalg.norm(firm - start, axis=1)[nodes].mean()
+
+    def off(**fields) -> float:
+        changed = dataclasses.replace(handle, **fields)
+        session.edit = dataclasses.replace(session.edit, handles=(changed,))
+        return float(np.linalg.norm(session.node_positions(0.0) - firm, axis=1)[nodes].mean() / way)
+
+    found = [off(stiffness=stiffness) for stiffness in (1e-4, 1e-2, 1e4)]
+    assert found[0] > 2 * found[1] > 0.02 and found[2] < 1e-3
+    assert off(turns=True) == 0.0 and off(stiffness=1e-2, turns=False) > 1.2 * found[1]
 
 
 @pytest.mark.parametrize("tips", [1, 6, 20])
