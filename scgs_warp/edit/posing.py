@@ -82,16 +82,10 @@ class Posing:
         of parts are removed."""
         if count is not None:
             self.parts(count)
-        kept = tuple(handle for handle in self.edit.handles if handle.part is None)
-        names = {handle.name for handle in kept}
-        targets = {name: target for name, target in self.edit.targets.items() if name in names}
-        frames = [
-            dataclasses.replace(k, targets={n: t for n, t in k.targets.items() if n in names})
-            for k in self.edit.keyframes
-        ]
-        frames = tuple(frame for frame, old in zip(frames, self.edit.keyframes) if frame.targets or not old.targets)
-        skeleton = None if count is None else self._found[count]
-        self.apply(dataclasses.replace(self.edit, handles=kept, targets=targets, keyframes=frames, skeleton=skeleton))
+        edit = self.edit
+        for handle in self.edit.handles:
+            edit = edit if handle.part is None else edit.without(handle.name)
+        self.apply(dataclasses.replace(edit, skeleton=None if count is None else self._found[count]))
 
     def save_skeleton(self) -> Path:
         """Write the present skeleton into the run folder, where it is the default of every later session.
@@ -111,8 +105,12 @@ class Posing:
         self._restructure(self.skeleton.renamed(old, new), {old: new})
 
     def merge_parts(self, first: str, second: str) -> None:
-        """Unite two neighbouring parts under the first one's name. A handle of the second is removed."""
-        self._restructure(self.skeleton.merged(first, second), {second: None})
+        """Unite two neighbouring parts under the first one's name. The whole turns as the part did on which the other
+        one hung (of two that hang on the same part, as the first one); a handle of the other one is removed."""
+        below = self.skeleton.part(first).parent == second
+        self._restructure(
+            self.skeleton.merged(first, second), {first: None, second: first} if below else {second: None}
+        )
 
     def split_part(self, name: str, nodes: Iterable[int], new: str | None = None) -> str:
         """Make some control points of a part a part of their own, which hangs on it; return its name."""

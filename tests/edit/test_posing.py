@@ -282,6 +282,28 @@ def test_the_skeleton_is_changed_and_undone(session):
     assert session.skeleton.names == names
 
 
+@pytest.mark.parametrize("order", [ARM, ARM[::-1]])
+def test_a_merged_part_turns_as_the_upper_one_did(session, order):
+    """Under either name: what hangs above the joint between the two stays where it is."""
+    upper = list(session.skeleton.part("shoulder_left").nodes)
+    session.turn("elbow_left", 60, (1, 0, 0))
+    bent, rest = session.edit, session.engine.to_world(session.engine.motion_at(0.0).positions)
+    session.merge_parts(*order)
+    assert session.skeleton.part(order[0]).parent == "torso" and not session.edit.handles
+    np.testing.assert_array_equal(session.node_positions(0.0), rest)
+    assert session.undo() and session.edit == bent
+    session.turn("shoulder_left", 70, (0, -1, 0))
+    before = session.node_positions(0.0)
+    session.merge_parts(*order)
+    assert [handle.part for handle in session.edit.handles] == [order[0]]
+    whole = furthest(session, order[0])
+    moved = rigid_fit(rest[whole], session.node_positions(0.0)[whole])[0]
+    np.testing.assert_allclose(moved, from_axis((0, -1, 0), 70), atol=1e-9)
+    off = np.linalg.norm(session.node_positions(0.0) - before, axis=1)
+    trunk = sorted(set(range(len(session))) - set(session.skeleton.part(order[0]).nodes))
+    assert off[upper].mean() < 0.04 and off[trunk].max() < 0.02, (off[upper].mean(), off[trunk].max())
+
+
 @pytest.mark.parametrize(
     "call, message",
     [
@@ -329,9 +351,13 @@ def test_a_side_branch_of_equal_size_ends_a_chain():
 def test_a_number_of_parts_replaces_the_skeleton(figure):
     session = figure.fork()
     session.turn("head", 20, (0, 0, 1))
+    session.add_keyframe(0.0)
     session.add_handle([3, 4], 0.0, "free")
+    session.add_keyframe(1.0)
     session.use_parts(6)
     assert len(session.skeleton.parts) == 6 and [h.name for h in session.edit.handles] == ["free"]
+    assert [(frame.at, list(frame.targets)) for frame in session.edit.keyframes] == [(1.0, ["free"])]
+    assert not session.edit.targets
     assert session.undo() and session.edit.handle("head") is not None
 
 
