@@ -66,6 +66,8 @@ def write_npz(
         arrays["node_shape_rotations"] = skeleton.shape_rotations
     if skeleton.own_rotations is not None and {"shading", "correctives"} & arrays.keys():
         arrays["node_own_rotations"] = skeleton.own_rotations
+    if skeleton.share is not None:
+        arrays["share"] = skeleton.share
     if skeleton.log_scales is not None:
         arrays["node_log_scales"] = skeleton.log_scales
     if skeleton.tints is not None:

@@ -63,11 +63,14 @@ class Skeleton:
     """Names of joints; None: numbers."""
     parents: tuple[int, ...] | None = None
     """Row of each joint's parent, -1: none; None: no joint has one."""
+    share: np.ndarray | None = None
+    """[N] share of the motion that each Gaussian takes, by a mask; the last joint, which stands still, has the rest of
+    its weight. None: there is no mask."""
 
     def select(self, rows: np.ndarray) -> Skeleton:
         """Restrict the binding to the Gaussians of ``rows`` [N] bool."""
-        fields = {**vars(self), "indices": self.indices[rows], "weights": self.weights[rows]}
-        return Skeleton(**fields)
+        share = None if self.share is None else self.share[rows]
+        return replace(self, indices=self.indices[rows], weights=self.weights[rows], share=share)
 
 
 def even_moments(frames: int, fps: float) -> list[AnimationMoment]:
@@ -243,15 +246,15 @@ def _with_rest(skeleton: Skeleton, gaussians: GaussianParameters) -> Skeleton:
         for track in (skeleton.log_scales, skeleton.tints)
     )
     middle = skeleton.rest.mean(axis=0, keepdims=True)
-    return Skeleton(
-        skeleton.seconds,
-        skeleton.times,
-        np.concatenate([skeleton.rest, middle]),
-        np.concatenate([skeleton.positions, np.broadcast_to(middle, (frames, 1, 3))], axis=1),
-        np.concatenate([skeleton.rotations, still], axis=1),
-        None if shapes is None else np.concatenate([shapes, still], axis=1),
-        sizes,
-        tints,
-        np.column_stack([skeleton.indices, np.full(len(share), joints, np.int32)]),
-        np.column_stack([share * skeleton.weights, 1.0 - share]),
+    return replace(
+        skeleton,
+        rest=np.concatenate([skeleton.rest, middle]),
+        positions=np.concatenate([skeleton.positions, np.broadcast_to(middle, (frames, 1, 3))], axis=1),
+        rotations=np.concatenate([skeleton.rotations, still], axis=1),
+        shape_rotations=None if shapes is None else np.concatenate([shapes, still], axis=1),
+        log_scales=sizes,
+        tints=tints,
+        indices=np.column_stack([skeleton.indices, np.full(len(share), joints, np.int32)]),
+        weights=np.column_stack([share * skeleton.weights, 1.0 - share]),
+        share=share[:, 0],
     )

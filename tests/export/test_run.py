@@ -45,11 +45,18 @@ def run(tmp_path_factory) -> Path:
     return moving_run(tmp_path_factory.mktemp("runs") / "run")
 
 
-def test_npz_is_played_by_the_script_in_the_documentation(run, tmp_path):
-    path = tmp_path / "a.npz"
+@pytest.fixture(scope="module")
+def masked_run(tmp_path_factory) -> Path:
+    return moving_run(tmp_path_factory.mktemp("runs") / "masked", masked=True)
+
+
+@pytest.mark.parametrize("name", ["run", "masked_run"])
+def test_npz_is_played_by_the_script_in_the_documentation(name, request, tmp_path):
+    path, run = tmp_path / "a.npz", request.getfixturevalue(name)
     export("--run", run, "--output", path, "--frames", 5, "--fps", 4)
     scene, data = Scene.load(run), dict(np.load(path))
     assert str(data["format"]) == "scgs-warp motion" and {"shading", "node_tints", "correctives"} <= data.keys()
+    assert ("share" in data) == (name == "masked_run")
     means, quats, scales, sh_dc = (None,) * 4
     for seconds, time in ((0.0, 0.0), (0.5, 0.5), (1.0, 1.0)):
         means, quats, scales, sh_dc = documented_player()["play"](data, seconds)

@@ -24,10 +24,10 @@ def save(scene: Scene, folder: Path) -> Path:
     return folder
 
 
-def moving_run(folder: Path) -> Path:
+def moving_run(folder: Path, masked: bool = False) -> Path:
     """Write a run whose network moves things a little, with shading and correctives."""
-    like = bar_scene(nodes=24, gaussians=120, shaded=True, corrected=True)
-    fields = {"nodes": 24, "layers": 3, "width": 32, "skip": 2}
+    like = bar_scene(nodes=24, gaussians=120, shaded=True, corrected=True, share=0.5 if masked else None)
+    fields = {"nodes": 24, "layers": 3, "width": 32, "skip": 2, "mask": masked}
     config = from_dict({"motion": fields, "sharpness": 0.0})
     template = build_motion("control-points", config)
     assert isinstance(template, ControlPoints)
@@ -38,6 +38,9 @@ def moving_run(folder: Path) -> Path:
     with torch.no_grad():
         for parameter in motion.network.parameters():
             parameter.copy_(0.3 * torch.randn_like(parameter))
+    if masked:
+        with torch.no_grad():
+            like.gaussians.hyper[:, -1] = torch.linspace(-60.0, 8.0, len(like.gaussians.hyper))
     scene = Scene(like.gaussians, motion, like.normalisation, config, like.overview)
     return save(scene, folder)
 
