@@ -196,6 +196,8 @@ def play_motion(session: EditSession, options: Options, device: str) -> None:
         motion = motion_of_session(source, source.edit.film.seconds)
     else:
         motion = motion_of_gltf(options.motion, options.clip)
+    if not motion.moves:
+        print(f"note: {options.motion}: nothing moves in it, so the scene takes one pose", file=sys.stderr)
     match = None if options.match is None else read_match(options.match)
     matched = retarget(session, motion, match, session.edit.playback.freeze or 0.0)
     print(f"{options.motion}: plays on {', '.join(matched)}", flush=True)

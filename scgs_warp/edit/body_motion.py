@@ -43,6 +43,14 @@ class BodyMotion:
     height: float
     """Extent along z at the first instant."""
 
+    @property
+    def moves(self) -> bool:
+        """Whether any part turns or moves."""
+        least = 1e-6
+        return bool(
+            (np.ptp(self.turns, axis=0) > least).any() or (np.ptp(self.shifts, axis=0) > least * self.height).any()
+        )
+
     def row(self, name: str) -> int:
         """Return the row of a part.
 
@@ -65,17 +73,20 @@ class BodyMotion:
 
 
 def motion_of_session(session: EditSession, seconds: float) -> BodyMotion:
-    """Take the motion of a trained scene's parts, as the session's edit shows it.
+    """Take the motion of a trained scene's parts, as the film of the session's edit shows it, with its playback and
+    keyframes.
 
     Args:
-        seconds: duration of the whole motion, above 0.
+        seconds: duration of the whole film, above 0.
     """
     skeleton, times = session.skeleton, _instants(seconds)
-    tracks = np.stack([session.node_positions(time / seconds) for time in times])
+    # A film that is played again has jumped back at its end.
+    moments = session.edit.film.seconds * np.minimum(times / seconds, 1.0 - 1e-9)
+    tracks = np.stack([session.node_positions(session.scene_time(at), at) for at in moments.tolist()])
     rows = {name: row for row, name in enumerate(skeleton.names)}
     turns = np.tile(IDENTITY, (len(times), len(rows), 1))
     shifts, centres = np.zeros((len(times), len(rows), 3)), np.zeros((len(rows), 3))
-    joints = np.array([part.joint for part in skeleton.parts])
+    joints = np.array([session.joint_of(name, session.scene_time(0.0), 0.0) for name in skeleton.names])
     for row, part in enumerate(skeleton.parts):
         nodes = list(part.nodes if len(part.nodes) > 3 else session.ring(part.nodes, 1))
         centres[row] = tracks[0, list(part.nodes)].mean(0)

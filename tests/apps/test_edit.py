@@ -13,6 +13,7 @@ import torch
 
 from helpers.edit_scenes import bar_scene, dress
 from helpers.edit_scripts import SCRIPT
+from helpers.export_runs import still_scene
 from scgs_warp.apps import edit as app
 from scgs_warp.edit import Edit, EditSession
 from scgs_warp.formats.gaussian_files import read_gaussians
@@ -111,6 +112,14 @@ def test_the_skeleton_is_printed(monkeypatch, capsys):
 def test_a_number_of_parts_is_taken(ply, capsys):
     assert app.cli(["--ply", str(ply), "--nodes", "40", "--skeleton", "--parts", "1"]) == 0
     assert len(capsys.readouterr().out.splitlines()) >= 2
+
+
+def test_a_motion_in_which_nothing_moves_is_named(ply, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr("scgs_warp.scene.scene.Scene.load", lambda *_, **__: still_scene())
+    (tmp_path / "match.json").write_text('{"part-1": "part-1"}')
+    command = ["--ply", str(ply), "--nodes", "40", "--motion", str(tmp_path), "--match", str(tmp_path / "match.json")]
+    assert app.cli([*command, "--skeleton"]) == 0
+    assert capsys.readouterr().err == f"note: {tmp_path}: nothing moves in it, so the scene takes one pose\n"
 
 
 def test_a_wrong_script_stops_the_app(ply, tmp_path, capsys):

@@ -14,6 +14,7 @@ from helpers.gltf_files import bar, box
 from scgs_warp.data.synthetic.figure_motion import bone_transforms
 from scgs_warp.edit import EditSession, motion_of_gltf, motion_of_session, retarget
 from scgs_warp.edit.body_motion import UP, BodyMotion
+from scgs_warp.edit.playback import Playback
 from scgs_warp.edit.retarget import match_names, read_match
 from scgs_warp.edit.rotations import IDENTITY, from_axis, least_turn, multiply, rotate, to_matrix
 from scgs_warp.errors import UserError
@@ -47,6 +48,31 @@ def test_a_scene_gives_the_turns_of_its_bones(session):
     assert motion.parents[motion.row("elbow_left")] == motion.row("shoulder_left")
     with pytest.raises(UserError, match="no part 'tail'"):
         motion.row("tail")
+
+
+def test_a_scene_gives_what_its_film_shows(session):
+    """Keyframes on a frozen scene, at the moments of a film of another length; joints are those of its beginning."""
+    edit = session.edit
+    session.turn("shoulder_left", 30, (0, -1, 0))
+    session.add_keyframe(0.0, "linear")
+    session.turn("shoulder_left", 60, (0, -1, 0))
+    session.add_keyframe(4.0)
+    session.apply(dataclasses.replace(session.edit, targets={}, playback=Playback(freeze=0.25)))
+    motion, row = motion_of_session(session, 2.0), session.skeleton.names.index("elbow_left")
+    assert motion.moves
+    begin = session.joint_of("elbow_left", 0.25, 0.0)
+    np.testing.assert_allclose(motion.joints[row], begin, atol=1e-9)
+    half = motion.seconds.tolist().index(1.0)
+    moved = session.joint_of("elbow_left", 0.25, 2.0) - begin
+    assert np.linalg.norm(moved) > 0.1
+    np.testing.assert_allclose(motion.shifts[half, row], moved, atol=0.03)
+    np.testing.assert_allclose(motion.turns[half, row], from_axis((0, -1, 0), 30), atol=0.05)
+    session.apply(dataclasses.replace(edit, playback=Playback(seconds=2.0, repeat="loop")))
+    looped = motion_of_session(session, 2.0)
+    np.testing.assert_allclose(looped.turns[0], looped.turns[12], atol=1e-6)
+    assert np.abs(looped.turns[-1] - looped.turns[0]).max() > 0.01
+    session.apply(dataclasses.replace(edit, playback=Playback(freeze=0.5)))
+    assert not motion_of_session(session, 2.0).moves
 
 
 def test_a_scene_plays_its_own_motion_on_itself(session):
