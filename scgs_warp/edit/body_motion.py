@@ -91,6 +91,8 @@ def motion_of_session(session: EditSession, seconds: float) -> BodyMotion:
         nodes = list(part.nodes if len(part.nodes) > 3 else session.ring(part.nodes, 1))
         centres[row] = tracks[0, list(part.nodes)].mean(0)
         for index in range(1, len(times)):
+            if np.array_equal(tracks[0, nodes], tracks[index, nodes]):
+                continue  # few points that stand still fit any rotation about the line through them
             quat, before, after = rigid_fit(tracks[0, nodes], tracks[index, nodes])
             turns[index, row] = quat
             shifts[index, row] = after - before + rotate(quat, joints[row] - before) - (joints[row] - before)
