@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -193,6 +193,21 @@ def plain_values(fields: Mapping[str, Any]) -> dict[str, Any]:
         return [plain(item) for item in value] if isinstance(value, (list, tuple)) else value
 
     return {name: plain(value) for name, value in fields.items()}
+
+
+def point_of(name: str, value: Sequence[float]) -> np.ndarray:
+    """Return a point [3] that a caller gives.
+
+    Raises:
+        UserError: it is not three finite numbers.
+    """
+    try:
+        point = np.asarray(value, np.float64)
+    except (TypeError, ValueError):
+        point = np.zeros(0)
+    if point.shape != (3,) or not np.isfinite(point).all() or np.abs(point).max() > MAX_NUMBER:
+        raise UserError(f"{name} {show_value(plain_values({name: value})[name])}: give 3 finite numbers")
+    return point
 
 
 def _printable(text: str) -> bool:

@@ -14,7 +14,7 @@ from ..types import Gaussians
 from . import edit_file, skeleton_file
 from .document import Edit
 from .engine import Engine
-from .field_reader import FieldReader
+from .field_reader import FieldReader, point_of
 from .graph import chosen_nodes
 from .handles import STAY, Handle, Target
 from .part_pose import JointFrame, PartMove, Rigid
@@ -149,7 +149,7 @@ class Posing:
         opaque = np.flatnonzero((self.engine.scene.gaussians.opacities() > MIN_OPACITY).cpu().numpy())
         if len(opaque):
             means = means[opaque]
-        nearest = int(((means - _point("point", point)) ** 2).sum(1).argmin())
+        nearest = int(((means - point_of("point", point)) ** 2).sum(1).argmin())
         return self.skeleton.names[int(self.gaussian_parts()[opaque[nearest] if len(opaque) else nearest])]
 
     def gaussian_parts(self) -> np.ndarray:
@@ -235,7 +235,7 @@ class Posing:
         Raises:
             UserError: there is no such part, or a number is wrong.
         """
-        place = _point("to", to)
+        place = point_of("to", to)
         before = since or self._before_drag or self.edit
         skeleton = before.skeleton or self._run_skeleton()
         names = skeleton.chain(part)
@@ -249,7 +249,7 @@ class Posing:
         if grip is None:
             held = now[list(skeleton.part(part).nodes)].mean(0)
         else:
-            held = motion.undo((_point("grip", grip) - centre) * scale)
+            held = motion.undo((point_of("grip", grip) - centre) * scale)
         place = (place - centre) * scale
         if skeleton.part(part).parent is None:
             targets = {handles[0].name: self._shifted(edit, skeleton, handles[0], time, place - motion.apply(held))}
@@ -294,7 +294,7 @@ class Posing:
         shift = old.translation
         if about is not None:
             centre, scale = self.engine.units
-            fixed = lead.undo((_point("about", about) - centre) * scale)
+            fixed = lead.undo((point_of("about", about) - centre) * scale)
             shift = self._shift_about(skeleton, handle, time, old, asked, fixed)
         further = self._into_frame(skeleton, handle, asked, time)
         target = Target.of(shift, multiply(further, np.array(old.rotation)).tolist())
@@ -388,10 +388,3 @@ def _with_handle(edit: Edit, skeleton: Skeleton, part: str, time: float) -> tupl
     names = [part, *(f"{part} ({i})" for i in range(2, len(taken) + 3))]
     handle = Handle(next(name for name in names if name not in taken), nodes, float(time), part=part)
     return dataclasses.replace(edit, handles=(*edit.handles, handle), skeleton=skeleton), handle
-
-
-def _point(name: str, value: Sequence[float]) -> np.ndarray:
-    point = np.asarray(value, np.float64)
-    if point.shape != (3,) or not np.isfinite(point).all() or np.abs(point).max() > 1e9:
-        raise UserError(f"{name} {list(value)}: give 3 finite numbers")
-    return point

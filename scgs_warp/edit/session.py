@@ -23,7 +23,7 @@ from ..types import Camera, Gaussians, Image
 from . import edit_file
 from .document import Edit
 from .engine import Engine
-from .field_reader import FieldReader
+from .field_reader import FieldReader, point_of
 from .graph import ControlGraph, chosen_nodes
 from .handles import STAY, Handle, Target
 from .keyframes import Easing, Keyframe
@@ -134,7 +134,8 @@ class EditSession(Posing):
 
     def nearest(self, point: Sequence[float], time: float, at: float | None = None) -> int:
         """Return the edited control point nearest to a point."""
-        return int(np.linalg.norm(self.node_positions(time, at) - np.asarray(point, np.float64), axis=1).argmin())
+        away = np.linalg.norm(self.node_positions(time, at) - point_of("point", point), axis=1)
+        return int(away.argmin())
 
     def ring(self, nodes: Iterable[int], count: int = 1) -> tuple[int, ...]:
         """Return the nodes and all nodes at most ``count`` edges away from them."""
@@ -142,7 +143,7 @@ class EditSession(Posing):
 
     def within(self, point: Sequence[float], radius: float, time: float, at: float | None = None) -> tuple[int, ...]:
         """Return the control points within ``radius`` of a point."""
-        away = np.linalg.norm(self.node_positions(time, at) - np.asarray(point, np.float64), axis=1)
+        away = np.linalg.norm(self.node_positions(time, at) - point_of("point", point), axis=1)
         return tuple(np.flatnonzero(away <= radius).tolist())
 
     def pick(self, camera: Camera, x: float, y: float, time: float, at: float | None = None) -> np.ndarray | None:
