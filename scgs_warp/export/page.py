@@ -7,12 +7,13 @@ import functools
 import hashlib
 import html
 import json
+import os
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
-from urllib.parse import quote
+from urllib.parse import quote, urljoin
 
 from ..errors import UserError
 from ..scene.scene import Scene
@@ -38,7 +39,9 @@ class Card:
 
     description: str = "A moving scene in three dimensions: turn it, stop it, look from anywhere."
     url: str = ""
-    """Address at which the page will be; with it, the card has a picture of the same name that ends in .jpg."""
+    """Address at which the page will be; with it, the card has a picture."""
+    picture: str = "page.jpg"
+    """Name of the picture's file, which will be in the same folder as the page."""
 
     def tags(self, title: str) -> str:
         """Return the elements of the page's head."""
@@ -51,7 +54,7 @@ class Card:
     @property
     def image(self) -> str:
         """Address of the card's picture."""
-        return re.sub(r"\.html?$", "", self.url, flags=re.IGNORECASE) + ".jpg"
+        return urljoin(self.url, quote(os.fsencode(self.picture)))
 
 
 @dataclass(frozen=True)
@@ -64,7 +67,8 @@ class PageOptions:
     """Largest size of the file in MiB. Colours lose their highest degrees of spherical harmonics, one by one, until it
     fits."""
     url: str = ""
-    """Address at which the page will be published. A picture for links to it is then written beside the page."""
+    """Address at which the page will be published. A picture for links to it is then written beside the page, under the
+    page's name with .jpg at the end, and must be published beside it."""
     motion: PageMotion | None = None
     """Motion that replaces the scene's, such as an edit's film or one with parts to pull."""
     captions: Sequence[Mapping[str, Any]] = ()
@@ -102,9 +106,14 @@ def write_page(scene: Scene, path: Path, options: PageOptions | None = None, **f
     except OSError as error:
         raise UserError(f"{path.parent}: cannot be made ({error.strerror}); give another folder") from None
     if options.url:
-        write_atomically(path.with_suffix(".jpg"), picture(CARD_SIZE))
+        write_atomically(card_path(path), picture(CARD_SIZE))
     write_atomically(path, page)
     return count
+
+
+def card_path(page: Path) -> Path:
+    """Return the path of the picture for links to a page."""
+    return page.with_suffix(".jpg")
 
 
 def fitting_page(scene: Scene, path: Path, options: PageOptions, picture: Callable[[int], bytes]) -> tuple[bytes, int]:
@@ -121,7 +130,8 @@ def fitting_page(scene: Scene, path: Path, options: PageOptions, picture: Callab
         content = page_scene(scene, degree, motion_of=options.motion)
         drawn = drawn or picture(POSTER_SIZE)  # after the scene has been checked
         facts = {**content.facts, "captions": list(options.captions)}
-        page = assemble(pack(facts, content.columns), options.title, drawn, Card(url=options.url), "pose" in facts)
+        card = Card(url=options.url, picture=card_path(path).name)
+        page = assemble(pack(facts, content.columns), options.title, drawn, card, "pose" in facts)
         if most is None or len(page) <= most * MIB:
             return page, content.facts["gaussians"]
     least = len(page) / MIB

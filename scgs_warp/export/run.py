@@ -329,7 +329,7 @@ def _export_mesh(request: ExportRequest, device: str) -> str:
 
 def _export_page(request: ExportRequest, device: str) -> str:
     from .captions import read_captions
-    from .page import PageOptions, write_page
+    from .page import PageOptions, card_path, write_page
 
     captions = [] if request.captions is None else read_captions(request.captions)
     scene = _open(request, device)
@@ -342,7 +342,8 @@ def _export_page(request: ExportRequest, device: str) -> str:
     count = write_page(scene, request.output, options)
     moves = scene.motion.moves or request.edit is not None
     parts = " and parts to pull" if request.pose else ""
-    return f"{count:,} Gaussians {'and their motion' if moves else 'that stand still'}{parts}"
+    card = f", with {card_path(request.output).name} for links to it" if request.url else ""
+    return f"{count:,} Gaussians {'and their motion' if moves else 'that stand still'}{parts}{card}"
 
 
 def _with_session(request: ExportRequest, scene: Scene, options: PageOptions) -> tuple[Scene, PageOptions]:

@@ -7,6 +7,7 @@ import hashlib
 import io
 from html.parser import HTMLParser
 from pathlib import Path
+from urllib.parse import unquote
 
 import numpy as np
 import pytest
@@ -130,6 +131,11 @@ def test_a_link_to_a_published_page_has_a_picture(tmp_path):
     parts = Parts(tmp_path / "page.html")
     card = {attrs["property"]: attrs["content"] for tag, attrs, _ in parts.found if "property" in attrs}
     assert card["og:image"] == 'https://example.org/a"b/page.jpg' and card["og:title"] == "A & B"
+    page.write_page(scene, tmp_path / "my page é.html", url="https://example.org/scenes/index.html?of=a/b")
+    found = [attrs for _, attrs, _ in Parts(tmp_path / "my page é.html").found if attrs.get("property") == "og:image"]
+    address = found[0]["content"]
+    assert address.startswith("https://example.org/scenes/my%20page") and address.isascii()
+    assert (tmp_path / unquote(address.rsplit("/", 1)[1])).is_file()
     with Image.open(tmp_path / "page.jpg") as picture, Image.open(io.BytesIO(poster(scene))) as small:
         assert max(picture.size) == 1200 and max(small.size) == 480
         assert np.asarray(small).max() > 50, "there is something to see"
