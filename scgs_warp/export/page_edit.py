@@ -42,7 +42,7 @@ def edited_motion(
     engine, edit = session.engine, session.edit
     if bool(session.scene.config.motion.mask) and engine.rig.moves:
         raise UserError(
-            "this scene's motion has a mask (motion.mask), so that no page can play an edit of it; write a film, or from "
+            "this scene's motion has a mask (motion.mask), so no page can play an edit of it; write a film, or from "
             "the command line a ply-sequence"
         )
     moments = film_times(session)
