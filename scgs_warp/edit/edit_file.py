@@ -129,7 +129,7 @@ def parse(content: Any, source: str, engine: Engine, default: Callable[[], Skele
     skeleton = None if own is None else skeleton_file.from_fields(own, len(engine.graph))
     for fields in root.children("handles", 1000):
         handle, skeleton = _handle(fields, engine, skeleton, default)
-        if version == 1 and handle.turns is None:
+        if version == 1 and handle.turns is None and handle.part is None:
             handle = dataclasses.replace(handle, turns=len(handle.nodes) > 1)
         if any(handle.name == other.name for other in handles):
             raise fields.wrong("name", f"{handle.name!r} is taken", "give every handle a name of its own")

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from helpers.edit_scenes import bar_scene
-from scgs_warp.edit import EditSession, skeleton_file
+from scgs_warp.edit import EditSession, edit_file, skeleton_file
 from scgs_warp.errors import UserError
 from scgs_warp.scene.from_gaussians import with_control_points
 
@@ -119,3 +119,11 @@ def test_a_still_run_keeps_its_skeleton(tmp_path):
     session.rename_part(session.skeleton.names[0], "left half")
     assert session.save_skeleton() == tmp_path / "skeleton.json"
     assert EditSession(with_control_points(still, 40)).skeleton == session.skeleton
+
+
+def test_a_part_is_turned_in_files_of_every_version(session):
+    """In version 1, ``turns`` of handles that pose a part had no effect, whatever its number of control points."""
+    content = {"format": "scgs-warp edit", "handles": [{"part": name} for name in session.skeleton.names]}
+    for version in (1, 2):
+        edit = edit_file.parse({**content, "version": version}, "the file", session.engine, lambda: session.skeleton)
+        assert {handle.turns for handle in edit.handles} == {None}
