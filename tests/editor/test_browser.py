@@ -275,3 +275,16 @@ def test_every_control_can_be_named_reached_and_read(browser, editor, size):
     assert window.page.get_by_role("heading", name="Keys").is_visible()
     assert window.page.evaluate("document.getElementById('keys').scrollTop") == 0, "it begins with its beginning"
     window.close()
+
+
+def test_the_scene_stays_in_sight_on_the_smallest_phones(browser, editor):
+    window = Window(browser, editor, size={"width": 320, "height": 568})
+    window.still()
+    window.page.get_by_role("button", name="Panel", exact=True).click()
+    for size in ({"width": 320, "height": 568}, {"width": 800, "height": 360}):
+        window.page.set_viewport_size(size)
+        window.still()
+        boxes = [window.page.locator(f"#{name}").bounding_box() for name in ("stage", "panel", "time")]
+        assert boxes[0]["height"] > 150 and boxes[1]["height"] > 60
+        assert all(box["y"] + box["height"] <= size["height"] for box in boxes)
+    window.close()
