@@ -147,3 +147,35 @@ def test_all_keys_are_deleted_and_undone(browser, editor):
         page.keyboard.press("Control+y")
     until(lambda: window.ask("!studio.link.state.redo") and keys.count() == 0)
     window.close()
+
+
+def test_a_key_follows_the_arrows_and_escape_leaves_it(browser, editor):
+    window = Window(browser, editor)
+    window.still()
+    page, mouse = window.page, window.page.mouse
+    window.ask("studio.link.ask('select', { what: 'nodes', nodes: [1, 2], how: 'replace' })")
+    for at in (0.0, 1.0):
+        window.ask("studio.link.ask('put', { at: argument, translation: [0, 0, 0.1 * argument + 0.1] })", at)
+        window.ask("studio.link.ask('key', { at: argument })", at)
+    keys = page.locator("#tracks .ruler .key")
+    until(lambda: keys.count() == 2)
+    keys.nth(1).focus()
+    for step in range(1, 4):
+        page.keyboard.press("ArrowRight")
+        moment = 1.0 + step / editor.session.edit.film.fps
+        until(lambda moment=moment: abs(editor.session.edit.keyframes[1].at - moment) < 1e-6)
+        until(lambda: page.evaluate("document.activeElement.classList.contains('chosen')"))
+    for _ in range(5):
+        page.keyboard.press("ArrowLeft")
+    window.still()
+    assert page.locator("#notes").inner_text() == "", "no key is sent away from where it no longer is"
+    edit, box = editor.session.edit, keys.nth(1).bounding_box()
+    mouse.move(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
+    mouse.down()
+    mouse.move(box["x"] + 90, box["y"] + box["height"] / 2, steps=3)
+    page.keyboard.press("Escape")
+    mouse.up()
+    window.still()
+    assert editor.session.edit == edit and keys.nth(1).bounding_box() == box
+    assert window.ask("studio.link.state.selection.length") == 2
+    window.close()

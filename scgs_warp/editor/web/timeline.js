@@ -15,6 +15,17 @@ class Timeline {
       clock.play(false);
       player.seek(this.share(event));
     };
+    document.addEventListener("keydown", (event) => {
+      if (event.key !== "Escape" || !this.moving) return;
+      event.stopImmediatePropagation(); // it leaves what is chosen alone
+      this.stay();
+    });
+  }
+
+  // A key that was pressed is where it was.
+  stay() {
+    this.moving = this.shown = null;
+    this.show(this.link.state);
   }
 
   share(event) {
@@ -59,7 +70,10 @@ class Timeline {
       return [title, lane];
     });
     if (views.length) lanes.splice(1, 0, this.cameraLane(state));
+    const focused = this.keyed && document.activeElement?.classList.contains("key"); // by arrows, which go on
     place.replaceChildren(...lanes.flat());
+    this.asked = false;
+    if (focused) place.querySelector(".key.chosen")?.focus();
     this.head = document.createElement("div");
     this.head.id = "head";
     this.head.style.height = `${place.scrollHeight}px`;
@@ -123,6 +137,7 @@ class Timeline {
       event.stopPropagation();
       button.setPointerCapture(event.pointerId);
       this.moving = { its, from: event.clientX, copy: event.altKey };
+      this.keyed = false;
     });
     button.addEventListener("pointermove", (event) => {
       if (this.moving?.its !== its) return;
@@ -142,17 +157,18 @@ class Timeline {
     });
     for (const name of ["pointercancel", "lostpointercapture"]) {
       button.addEventListener(name, () => {
-        if (this.moving?.its !== its) return;
-        this.moving = null;
-        this.show(this.link.state);
+        if (this.moving?.its === its) this.stay();
       });
     }
-    button.addEventListener("keydown", (event) => {
+    button.addEventListener("keydown", async (event) => {
       if (event.key === "Enter") this.choose(its);
       if (event.key === "ArrowLeft" || event.key === "ArrowRight") {
         event.preventDefault();
         const to = Math.max(0, frame.at + (event.key === "ArrowLeft" ? -1 : 1) / state.film.fps);
-        this.change("move", its, { to });
+        if (this.asked || to === frame.at) return; // one after the other
+        this.asked = this.keyed = true;
+        this.chosen = { name, at: to };
+        if ((await this.change("move", its, { to })).problem) this.asked = false;
       }
     });
     return button;
