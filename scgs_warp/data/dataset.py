@@ -83,6 +83,7 @@ class Dataset(Sequence[Frame]):
         colors: Tensor | None = None,
         cache: ImageCache | None = None,
         notes: Sequence[str] = (),
+        bounds: tuple[float, float] | None = None,
     ) -> None:
         self.entries = tuple(frames)
         """Camera, time and name of each frame, without pixels unless the frame is in memory."""
@@ -97,6 +98,8 @@ class Dataset(Sequence[Frame]):
         self.cache = cache if cache is not None else ImageCache()
         self.notes = tuple(notes)
         """Lines on what was left out, for the user."""
+        self.bounds = bounds
+        """Nearest and farthest depth of the content, world units; None if the data does not tell."""
 
     def _with(self, entries: Sequence[Frame | StoredFrame]) -> Dataset:
         return Dataset(
@@ -108,6 +111,7 @@ class Dataset(Sequence[Frame]):
             colors=self.colors,
             cache=self.cache,
             notes=self.notes,
+            bounds=self.bounds,
         )
 
     def with_cameras(self, cameras: Sequence[Camera]) -> Dataset:

@@ -22,6 +22,12 @@ STEEPEST = 80.0
 ROUNDING = 2e-6
 """Relative error of positions taken from float32 viewmats, as a share of their distance from the origin."""
 
+PARALLEL = 1e-4
+"""Threshold for the smallest eigenvalue of the mean of I - d d^T over the directions d of the optical axes. The axes
+define a nearest point if the eigenvalue exceeds it. It corresponds to angles of about 1 degree between them."""
+AHEAD = 20.0
+"""Distance of a scene from cameras that look the same way, in units of their spread, where nothing tells it."""
+
 Vector = Sequence[float] | np.ndarray | Tensor
 
 
@@ -94,26 +100,47 @@ def agreed_up(rotations: np.ndarray) -> np.ndarray:
     return np.array([0.0, 0.0, 1.0])
 
 
-def _centre(positions: np.ndarray, axes: np.ndarray) -> np.ndarray:
+def places_and_directions(cameras: Sequence[Camera]) -> tuple[np.ndarray, np.ndarray]:
+    """Return the camera centres [V, 3] and the unit vectors [V, 3] of the optical axes, float64."""
+    viewmats = torch.stack([camera.viewmat.detach().cpu() for camera in cameras]).double().numpy()
+    positions = -np.einsum("vij,vi->vj", viewmats[:, :3, :3], viewmats[:, :3, 3])
+    return positions, viewmats[:, 2, :3] / np.linalg.norm(viewmats[:, 2, :3], axis=1, keepdims=True)
+
+
+def _centre(positions: np.ndarray, axes: np.ndarray, distance: float | None) -> np.ndarray:
     """Return the point with the least squared distance to all optical axes, [3].
 
-    If the axes are parallel or meet behind the cameras, return a point in front of the mean camera instead, at three
-    times the cameras' spread.
+    If a distance is given, or the axes are parallel or meet behind the cameras, return a point ahead of them instead.
     """
-    least = rounding(positions)
-    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
-    matrix = across.mean(0)
-    if np.linalg.eigvalsh(matrix)[0] > 1e-5:
-        centre = np.linalg.solve(matrix, np.einsum("vij,vj->i", across, positions) / len(positions))
-        depths = np.einsum("vi,vi->v", centre - positions, axes)
-        if np.median(depths) > least and (depths > 0).mean() >= 0.75:
-            return centre
-    middle = positions.mean(0)
-    spread = float(np.linalg.norm(positions - middle, axis=1).max())
-    forward = axes.mean(0)
+    if distance is None:
+        centre, least = nearest_to_axes(positions, axes), rounding(positions)
+        if centre is not None:
+            depths = np.einsum("vi,vi->v", centre - positions, axes)
+            if np.median(depths) > least and (depths > 0).mean() >= 0.75:
+                return centre
+    return point_ahead(positions, axes, distance)
+
+
+def nearest_to_axes(positions: np.ndarray, axes: np.ndarray) -> np.ndarray | None:
+    """Return the point x nearest to all optical axes (directions d, through p): sum (I - d d^T)(x - p) = 0; None if
+    they are parallel."""
+    projectors = np.eye(3) - axes[:, :, None] * axes[:, None, :]
+    matrix = projectors.mean(axis=0)
+    if np.linalg.eigvalsh(matrix)[0] <= PARALLEL:
+        return None
+    return np.linalg.solve(matrix, np.einsum("vij,vj->i", projectors, positions) / len(positions))
+
+
+def point_ahead(positions: np.ndarray, axes: np.ndarray, distance: float | None) -> np.ndarray:
+    """Return the point [3] at a distance before the mean camera, or amid the cameras of a panorama. Without a distance,
+    it is ``AHEAD`` times the cameras' spread, or 1 for cameras at one place."""
+    middle, forward = positions.mean(axis=0), axes.mean(axis=0)
     if np.linalg.norm(forward) < 1e-3:  # a panorama: the scene surrounds the cameras
         return middle
-    return middle + _unit(forward) * (3 * spread if spread > least else 1.0)
+    if distance is None:
+        spread = float(np.linalg.norm(positions - middle, axis=1).max())
+        distance = AHEAD * spread if spread > rounding(positions) else 1.0
+    return middle + _unit(forward) * distance
 
 
 def rounding(positions: np.ndarray) -> float:
@@ -136,11 +163,12 @@ def _arc(azimuths: np.ndarray) -> tuple[float, float]:
     return float(ordered[(widest + 1) % len(ordered)]), float(360.0 - gaps[widest])
 
 
-def overview(cameras: Sequence[Camera]) -> Overview:
+def overview(cameras: Sequence[Camera], distance: float | None = None) -> Overview:
     """Summarise training cameras, from a small arc to a full orbit.
 
     Args:
         cameras: at least one, world units.
+        distance: where the optical axes do not meet, the distance of the scene before the mean camera, if it is known.
 
     Raises:
         ValueError: ``cameras`` is empty.
@@ -151,7 +179,7 @@ def overview(cameras: Sequence[Camera]) -> Overview:
     rotations = viewmats[:, :3, :3]
     positions = -np.einsum("vji,vj->vi", rotations, viewmats[:, :3, 3])
     up = agreed_up(rotations)
-    centre = _centre(positions, rotations[:, 2])
+    centre = _centre(positions, rotations[:, 2], distance)
     offsets = positions - centre
     distances = np.linalg.norm(offsets, axis=1)
     heights = offsets @ up

@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from ..types import Camera
-from .cameras import rounding
+from .cameras import nearest_to_axes, places_and_directions, point_ahead, rounding
 
 COMMON_RADIUS = 1.3654
 """Radius, after normalisation, of the region that all cameras see, or of the bulk of the initial points. It is chosen
@@ -20,9 +20,6 @@ BULK = 0.95
 """Fraction of the initial points placed within COMMON_RADIUS; the rest may be far background."""
 FEWEST_POINTS = 10
 """Smallest number of initial points from which the scene is located; with fewer points the cameras are used."""
-PARALLEL = 1e-4
-"""Threshold for the smallest eigenvalue of the mean of I - d d^T over the directions d of the optical axes. The axes
-define a nearest point if the eigenvalue exceeds it. It corresponds to angles of about 1 degree between them."""
 
 
 @dataclass(frozen=True)
@@ -39,7 +36,7 @@ class Normalisation:
         return Normalisation(np.zeros(3), 1.0)
 
     @staticmethod
-    def fit(cameras: Sequence[Camera], points: Tensor | None = None) -> Normalisation:
+    def fit(cameras: Sequence[Camera], points: Tensor | None = None, distance: float | None = None) -> Normalisation:
         """Fit centre and scale to ten or more initial points (median; 95 % within the radius), or else to the cameras.
 
         From cameras, the centre is the point nearest to all optical axes, and the radius is that of the largest sphere
@@ -48,6 +45,8 @@ class Normalisation:
         Args:
             cameras: at least one.
             points: [P, 3] world.
+            distance: without points, where the optical axes do not meet: the distance of the scene before the mean
+                camera, if it is known.
 
         Raises:
             ValueError: ``cameras`` is empty.
@@ -63,7 +62,7 @@ class Normalisation:
                 if radius > 0:
                     return Normalisation(centre, COMMON_RADIUS / radius)
         positions, axes, sines = _rig(cameras)
-        centre = _nearest_to_axes(positions, axes)
+        centre = _centre(positions, axes, distance)
         radius = float(np.median(np.linalg.norm(positions - centre, axis=1) * sines))
         return Normalisation(centre, COMMON_RADIUS / radius if radius > 0 else 1.0)
 
@@ -114,27 +113,17 @@ def _change_of_cameras(centre: tuple[float, ...], scale: float, device: torch.de
 
 def _rig(cameras: Sequence[Camera]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return camera centres [V, 3], viewing directions [V, 3], and sines [V] of half the narrower field of view."""
-    viewmats = torch.stack([camera.viewmat for camera in cameras]).double().cpu().numpy()
+    positions, axes = places_and_directions(cameras)
     Ks = torch.stack([camera.K for camera in cameras]).double().cpu().numpy()
     sizes = np.array([(camera.width, camera.height) for camera in cameras], np.float64)
-    positions = -np.einsum("vij,vi->vj", viewmats[:, :3, :3], viewmats[:, :3, 3])
-    axes = viewmats[:, 2, :3] / np.linalg.norm(viewmats[:, 2, :3], axis=1, keepdims=True)
     half = (0.5 * sizes / Ks[:, [0, 1], [0, 1]]).min(axis=1)
     return positions, axes, half / np.sqrt(1.0 + half * half)
 
 
-def _nearest_to_axes(positions: np.ndarray, axes: np.ndarray) -> np.ndarray:
-    """Return the point x nearest to all optical axes (directions d, through p): sum (I - d d^T)(x - p) = 0.
-
-    Near-parallel axes leave x undetermined along their direction; x then lies ahead of the cameras by twice the rig's
-    size.
-    """
-    projectors = np.eye(3) - np.einsum("vi,vj->vij", axes, axes)
-    A, least = projectors.mean(axis=0), rounding(positions)
-    if np.linalg.eigvalsh(A)[0] > PARALLEL:
-        centre = np.linalg.solve(A, np.einsum("vij,vj->i", projectors, positions) / len(positions))
-        if np.median(np.einsum("vi,vi->v", centre - positions, axes)) > least:
-            return centre
-    middle = positions.mean(axis=0)
-    spread = float(np.linalg.norm(positions - middle, axis=1).max())
-    return middle + axes.mean(axis=0) * (2.0 * spread if spread > least else 1.0)
+def _centre(positions: np.ndarray, axes: np.ndarray, distance: float | None) -> np.ndarray:
+    """Return the point nearest to all optical axes. If a distance is given, or the axes are parallel or meet behind the
+    cameras, it lies ahead of them."""
+    centre = nearest_to_axes(positions, axes) if distance is None else None
+    if centre is not None and np.median(np.einsum("vi,vi->v", centre - positions, axes)) > rounding(positions):
+        return centre
+    return point_ahead(positions, axes, distance)

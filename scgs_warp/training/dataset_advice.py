@@ -17,6 +17,7 @@ from ..config.presets import TrainConfig
 from ..data.dataset import Dataset, spread
 from ..geometry.normalisation import FEWEST_POINTS, Normalisation
 from ..types import Frame
+from .scene_distance import place
 from .silhouettes import is_in_parts, is_thin
 from .standing_cameras import LATE, standing_groups
 
@@ -90,6 +91,8 @@ class Survey:
     """Number of frames with a depth map."""
     standing: int = 0
     """Number of cameras, if all frames are of several that stand still and record at the same time."""
+    guessed: bool = False
+    """True if the distance of the scene from the cameras is a guess."""
 
 
 def survey(data: Dataset) -> Survey:
@@ -98,7 +101,8 @@ def survey(data: Dataset) -> Survey:
     instants, counts = np.unique(times, return_counts=True)
     steps = np.diff(instants)
     widest = int(steps.argmax()) if len(steps) else 0
-    normalisation = Normalisation.fit(data.cameras, data.points)
+    placed = place(data)
+    normalisation = placed.normalisation
     directions = _directions(data, normalisation)
     order = np.argsort(times, kind="stable")
     near = directions[order]
@@ -129,6 +133,7 @@ def survey(data: Dataset) -> Survey:
         look_away=looks_away(data),
         depth_maps=len(data.with_depth),
         standing=len(groups),
+        guessed=placed.guessed,
     )
 
 
@@ -238,6 +243,8 @@ def _expectation(facts: Survey, compares_depth: bool) -> str:
         )
     if facts.instants < 2:
         return "a scene at rest: all frames are of one instant"
+    if facts.guessed and not compares_depth:
+        return "good views near the cameras only: how far away the scene is remains a guess, as they look the same way"
     if facts.arc < LITTLE_PARALLAX and not compares_depth:
         return f"good views near the cameras only: they lie within {facts.arc:.1f} degrees, which leaves depth unknown"
     if facts.gap[1] - facts.gap[0] > max(GAP * facts.typical_gap, 0.05):

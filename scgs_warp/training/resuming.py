@@ -5,11 +5,14 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import numpy as np
+
 from ..config.presets import FREE_TO_CHANGE, TrainConfig
 from ..data.dataset import Dataset
 from ..data.thumbnails import differ, thumbnails
 from ..errors import UserError
-from ..geometry.cameras import Overview, overview
+from ..geometry.cameras import Overview, overview, places_and_directions
+from .scene_distance import depth_ahead
 
 SAME_CAMERAS = 0.02
 """Largest relative difference between two summaries of the same cameras, which versions may compute differently."""
@@ -39,9 +42,10 @@ def check_same_frames(saved: dict[str, Any], data: Dataset, source: str) -> None
     """
     if saved.get("frames") != data.fingerprint:
         raise UserError(f"{source}: made from other frames than those of {data.folder}; give the same --data")
-    then, now = Overview.from_dict(saved["overview"]), overview(data.cameras)
-    shift, turn = math.dist(then.centre, now.centre) / then.radius, math.dist(then.up, now.up)
-    if max(shift, turn, abs(now.radius / then.radius - 1.0), abs(now.fov_x / then.fov_x - 1.0)) > SAME_CAMERAS:
+    then = Overview.from_dict(saved["overview"])
+    # Where the axes do not meet, the distance of the scene is not a property of the cameras.
+    ahead = depth_ahead(*places_and_directions(data.cameras), np.array(then.centre))
+    if not any(_alike(then, overview(data.cameras, distance)) for distance in (None, ahead)):
         raise UserError(
             f"{source}: made with other cameras than those of {data.folder}; restore them, or train again with "
             "another --output"
@@ -52,6 +56,11 @@ def check_same_frames(saved: dict[str, Any], data: Dataset, source: str) -> None
             f"{source}: made from other images than those of {data.folder}, which have the same names; give the same "
             "--data, or train again with another --output"
         )
+
+
+def _alike(then: Overview, now: Overview) -> bool:
+    shift, turn = math.dist(then.centre, now.centre) / then.radius, math.dist(then.up, now.up)
+    return max(shift, turn, abs(now.radius / then.radius - 1.0), abs(now.fov_x / then.fov_x - 1.0)) <= SAME_CAMERAS
 
 
 def check_same_configuration(

@@ -15,7 +15,7 @@ from ..config.recorded import with_newer_fields
 from ..data.dataset import Dataset
 from ..errors import UserError
 from ..gaussians import GaussianParameters
-from ..geometry.cameras import Overview, overview
+from ..geometry.cameras import Overview
 from ..geometry.normalisation import COMMON_RADIUS, FEWEST_POINTS, Normalisation
 from ..motion import ControlPoints
 from ..motion.base import Motion
@@ -46,6 +46,7 @@ from .pretrain import (
 )
 from .process_group import ProcessGroup
 from .resuming import check_same_configuration, check_same_frames, check_steps
+from .scene_distance import place
 from .second_config import may_be_tried_again
 from .silhouettes import half_thickness, is_in_parts, is_thin
 from .start_motion import SeenMotion, learn_motion
@@ -126,13 +127,14 @@ class TrainState:
     @staticmethod
     def begin(config: TrainConfig, data: Dataset, device: str) -> TrainState:
         """Make the state at step 0."""
-        normalisation = Normalisation.fit(data.cameras, data.points)
+        placed = place(data)
+        normalisation = placed.normalisation
         config = resolve_auto(config, data)
         initial = _initial_points(config, data, normalisation)
         points, colors = initial.points.to(device), initial.colors.to(device)
         # Cameras that stand still have no extent; the extent of the content is used instead.
         extent = max(data.extent * normalisation.scale, COMMON_RADIUS)
-        rest = (normalisation, overview(data.cameras), extent, points, colors)
+        rest = (normalisation, placed.overview, extent, points, colors)
         identity = {"fingerprint": data.fingerprint, "frames": len(data), "data": data}
         if config.pretrain_steps > 0:
             wide = THICKEST * half_thickness(data, normalisation) if config.pretrain.silhouette > 0 else math.inf

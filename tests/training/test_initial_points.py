@@ -40,7 +40,7 @@ def test_points_begin_in_the_common_view():
     data = handheld(20, 0.0)
     for index, entry in enumerate(data.entries):
         entry.camera.viewmat[0, 3] += 0.4 * index
-    normalisation = Normalisation.fit(data.cameras)
+    normalisation = Normalisation.fit(data.cameras, distance=7.6)
     plain = random_points(2000, 0, 31)
     points, colors = sample_initial_points(2000, data, normalisation, 0, 31)
     assert colors is None and points.shape == (2000, 3)

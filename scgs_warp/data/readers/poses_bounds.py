@@ -83,8 +83,15 @@ def read(folder: Path, split: str, options: ReadOptions) -> Dataset:
     choice = choose(path, [r.file for r in records], [r.time for r in records], options)
     frames = [replace(records[index], time=choice.times[index]) for index in choice.indices]
     data = assemble(frames, options, folder=folder, split=split, notes=choice.notes)
+    data.bounds = _bounds(rows[wanted, 15:])
     points = next((folder / name for name in POINTS if (folder / name).is_file()), None)
     return data if points is None else with_points(data, *read_points(points))
+
+
+def _bounds(depths: np.ndarray) -> tuple[float, float] | None:
+    """Return the nearest and the farthest of the cameras' depths [C, 2]; None if they are no depths."""
+    near, far = float(depths[:, 0].min()), float(depths[:, 1].max())
+    return (near, far) if 0.0 < near < far < np.inf else None
 
 
 def read_rows(path: Path) -> np.ndarray:
