@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Container, Iterator
-from itertools import islice
+from itertools import islice, pairwise
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 
 from ..data.images import is_complete, oversized_claim, size_text
+from ..data.name_times import moments_in_names
 from ..data.natural_order import natural
 from ..errors import UserError
 from .completeness import Incomplete, header_of, incomplete
@@ -31,7 +32,7 @@ class SourceFrame(NamedTuple):
     index: int
     """Index in the video or in the order of names, from 0."""
     seconds: float
-    """Time since the first frame, seconds; for a folder, the index."""
+    """Time since the first frame, seconds; for a folder, in units of the usual time between two images."""
     image: np.ndarray
     """[H, W, 3] uint8 RGB"""
     name: str
@@ -221,6 +222,7 @@ class Folder:
         self.count = len(files)
         if not files:
             raise UserError(f"{path}: holds no images ({', '.join(SUFFIXES)}); give the folder that does, or a video")
+        self.moments = _moments([file.name for file in self.files])
 
     def frames(self, longest: int) -> Iterator[SourceFrame]:
         size = None
@@ -232,10 +234,20 @@ class Folder:
                     f"{file}: is {size_text(image.shape[1::-1])}, but {self.files[0].name} is {size_text(size)}; "
                     "give images of one camera and one size"
                 )
-            yield SourceFrame(index, float(index), shrunk(image, longest), file.name)
+            yield SourceFrame(index, self.moments[index], shrunk(image, longest), file.name)
 
     def digest(self) -> str:
         return _digest(self.files)
+
+
+def _moments(names: list[str]) -> list[float]:
+    """Return the times of images in the order of their names, the usual time between two of them being 1: those in the
+    names if these rise, else the index."""
+    moments = moments_in_names(names)
+    steps = sorted(after - before for before, after in pairwise(moments or []))
+    if moments is None or steps[0] <= 0:
+        return [float(index) for index in range(len(names))]
+    return [float((moment - moments[0]) / steps[len(steps) // 2]) for moment in moments]
 
 
 def is_shown(file: Path) -> bool:

@@ -99,3 +99,20 @@ def test_a_codec_that_nobody_knows(tmp_path):
     (tmp_path / "film.mkv").write_bytes(content.replace(b"V_MPEG4/ISO/AVC", b"V_UNHEARD/OF/XX"))
     with pytest.raises(UserError, match=r"film\.mkv"):
         list(Video(tmp_path / "film.mkv").frames(64))
+
+
+@pytest.mark.parametrize(
+    ("names", "expected"),
+    [
+        (["0001.png", "0002.png", "0003.png", "0010.png"], [0.0, 1.0, 2.0, 9.0]),
+        (["5.png", "10.png", "20.png"], [0.0, 0.5, 1.5]),
+        (["1403636579763555584.png", "1403636579813555584.png", "1403636579913555584.png"], [0.0, 0.5, 1.5]),
+        (["a12.png", "b3.png", "c7.png"], [0.0, 1.0, 2.0]),  # not in the order of the names
+        (["0001_a.png", "0001_b.png", "0002_a.png"], [0.0, 1.0, 2.0]),  # twice the same
+        (["x.png", "y.png"], [0.0, 1.0]),
+    ],
+)
+def test_images_of_a_folder_have_the_times_in_their_names(names, expected, tmp_path):
+    for name in names:
+        write_png(tmp_path / name, np.zeros((8, 8, 3), np.uint8))
+    assert [frame.seconds for frame in Folder(tmp_path).frames(8)] == expected

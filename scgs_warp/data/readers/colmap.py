@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Callable
-from fractions import Fraction
 from functools import partial
 from pathlib import Path, PurePosixPath
 
@@ -17,13 +15,10 @@ from ..far_origin import moved, note, offset_of
 from ..held_out import held_out
 from ..images import ReadOptions, header_sizes, size_text
 from ..lens import Lens, make_lens
+from ..name_times import times_from_names
 from ..natural_order import natural
 from .colmap_model import ModelCamera, ModelImage, find_model, read_model
 
-SECONDS = re.compile(r"(?:.*[^0-9.A-Za-z])?([0-9]{1,15}\.[0-9]{1,15})")
-"""Names that end with a decimal, which no letter precedes: ``cam1.0002`` is a camera and a frame."""
-CAMERA = re.compile(r"(?:camera|cam|view)[ _-]?[0-9]+", re.IGNORECASE)
-"""Number of a camera in a name, such as ``0001_cam2``."""
 MADE_FROM = "give the images that the model was made from, with their names"
 """What to do about missing images."""
 
@@ -36,9 +31,9 @@ def recognises(folder: Path) -> bool:
 def read(folder: Path, split: str, options: ReadOptions) -> Dataset:
     """Read one split: every eighth image, in the order of names, is held out for ``test`` and ``val`` alike.
 
-    A model has no times. If every file name contains a number, the last number of each name is the image's time. Images
-    that COLMAP did not register then leave a gap, and cameras with equally numbered files share times. Otherwise the
-    images are evenly spaced in the order of their names.
+    A model has no times; they are those in the images' names (:func:`moments_in_names`). Images that COLMAP did not
+    register then leave a gap, and cameras with equally numbered files share times. If the names tell none, the images
+    are evenly spaced in their order.
 
     Raises:
         UserError: the data is invalid; one line names the file, the field and the remedy.
@@ -102,27 +97,6 @@ def _fits(lens: Callable[[tuple[int, int]], Lens], size: tuple[int, int]) -> boo
     except UserError:
         return False
     return True
-
-
-def times_from_names(names: list[str]) -> list[float]:
-    """Return times in [0, 1]: from the last number in each name if all names have one and the numbers differ, else from
-    the order. Names that end with decimals, such as ``1311868164.363181``, have their times in seconds. A number after
-    ``cam``, ``camera`` or ``view`` is that of a camera, unless the names have no other."""
-    stems = [PurePosixPath(name).stem for name in names]
-    frames = [re.findall("[0-9]+", CAMERA.sub("", stem)) for stem in stems]
-    if all(frames) and len({numbers[-1] for numbers in frames}) > 1:
-        stems = [CAMERA.sub("", stem) for stem in stems]
-    decimals = [SECONDS.fullmatch(stem) for stem in stems]
-    seconds = [Fraction(found[1]) for found in decimals if found]
-    digit_groups = [re.findall(r"[0-9]{1,15}", stem) for stem in stems]
-    if all(digit_groups):
-        numbers = [Fraction(digits[-1]) for digits in digit_groups]
-        if len(seconds) == len(names) and len({int(second) for second in seconds}) > 1:  # else, 2.9 comes before 2.10
-            numbers = seconds
-        first, last = min(numbers), max(numbers)
-        if last > first:
-            return [float((number - first) / (last - first)) for number in numbers]
-    return [index / max(len(names) - 1, 1) for index in range(len(names))]
 
 
 def _lens(model_folder: Path, image: ModelImage, camera: ModelCamera, source: tuple[int, int]) -> Lens:

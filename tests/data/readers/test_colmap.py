@@ -22,7 +22,6 @@ from helpers.layouts import (
     write_colmap,
 )
 from scgs_warp.data import load
-from scgs_warp.data.readers import colmap
 from scgs_warp.errors import UserError
 
 FOUND = 0.75
@@ -54,28 +53,6 @@ def test_colmap(tmp_path, model, text):
     np.testing.assert_allclose(train.colors, COLORS / 255.0, atol=1e-6)
     np.testing.assert_allclose(train[0].camera.viewmat, viewmat(0), atol=1e-6)
     np.testing.assert_allclose(test.times, [4 / 13, 12 / 13], atol=1e-6)
-
-
-@pytest.mark.parametrize(
-    ("names", "expected"),
-    [
-        (["frame_9.png", "frame_10.png", "frame_12.png"], [0.0, 1 / 3, 1.0]),  # 11 was not registered
-        (["left/1.png", "left/2.png", "right/1.png"], [0.0, 1.0, 0.0]),
-        (["a.png", "b.png", "c.png"], [0.0, 0.5, 1.0]),
-        (["a1.png", "b.png", "c1.png"], [0.0, 0.5, 1.0]),
-        (["7.png", "b7.png", "c7.png"], [0.0, 0.5, 1.0]),
-        (["only 1.png"], [0.0]),
-        (["8.3.png", "8.75.png", "9.031.png", "10.3.png"], [0.0, 0.225, 0.3655, 1.0]),  # seconds
-        (["take 2.9.png", "take 2.10.png", "take 2.11.png"], [0.0, 0.5, 1.0]),
-        (["cam1.0001.png", "cam1.0002.png", "cam2.0001.png", "cam2.0002.png"], [0.0, 1.0, 0.0, 1.0]),
-        (["0000_cam1.png", "0000_cam2.png", "0003_cam1.png", "0004_cam2.png"], [0.0, 0.0, 0.75, 1.0]),
-        (["Camera 1-0005.png", "Camera 2-0005.png", "Camera 2-0009.png"], [0.0, 0.0, 1.0]),
-        (["cam_0001.png", "cam_0002.png", "cam_0005.png"], [0.0, 0.25, 1.0]),
-        (["v1.2_0003.png", "v2.2_0004.png", "v3.2_0007.png"], [0.0, 0.25, 1.0]),
-    ],
-)
-def test_times_in_names(names, expected):
-    assert colmap.times_from_names(names) == pytest.approx(expected, abs=1e-6)
 
 
 def test_a_scene_far_from_the_origin(tmp_path):
