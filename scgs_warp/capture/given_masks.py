@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 
 from ..data.images import size_text
+from ..data.mask_files import classes_of, is_in_alpha
 from ..errors import UserError
 from .moving import frame_name
 from .source import Folder, Source, open_source, read_image, read_rgb
@@ -95,6 +96,12 @@ def _values_of(file: Path) -> _Values:
 
 def _of_folder(path: Path, files: Sequence[Path]) -> Iterator[np.ndarray]:
     """Yield masks as bytes [H, W, 3], 255 where nothing moves. What their numbers mean is decided for all alike."""
+    if all(classes_of(file) is not None for file in files):
+        for file in files:
+            classes = classes_of(file)
+            assert classes is not None
+            yield cv2.cvtColor(np.where(classes > 0, 255, 0).astype(np.uint8), cv2.COLOR_GRAY2RGB)
+        return
     each = [_values_of(file) for file in files]
     values = each[0]
     if len({one.kind for one in each}) > 1:
@@ -102,12 +109,7 @@ def _of_folder(path: Path, files: Sequence[Path]) -> Iterator[np.ndarray]:
         return
     colors = min(one.colors[0] for one in each), max(one.colors[1] for one in each)
     alphas = min(one.alphas[0] for one in each), max(one.alphas[1] for one in each)
-    in_alpha = colors[0] == colors[1] and alphas[0] < alphas[1]
-    if in_alpha and colors[0] < values.largest:
-        raise UserError(
-            f"{path}: masks differ in their alpha channel only, and black that is transparent may mean either; save "
-            "them without alpha, black where something moves and white elsewhere"
-        )
+    in_alpha = is_in_alpha(path, colors, alphas, values.largest)
     most = alphas[1] if in_alpha else colors[1]
     white = most if most in (1.0, 255.0) else values.largest
     if most < 0.5 * white:

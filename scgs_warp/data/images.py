@@ -25,6 +25,7 @@ from ..storage.safe_paths import is_regular
 from .borders import reduce_mask
 from .cache import ImageCache, Pixels
 from .lens import Lens, undistort, valid_pixels
+from .mask_files import classes_of, is_in_alpha
 from .orientation import TAG, UPRIGHT, read_orientation, swaps_sides, upright
 
 RESAMPLES = ("area", "bicubic")
@@ -205,9 +206,16 @@ def read_mask(path: Path, image: Path, size: tuple[int, int]) -> np.ndarray:
     """Read a mask: [H, W] bool, True where it is not black. ``size``: (width, height) of its image.
 
     Raises:
-        UserError: the file is missing or does not decode, is all black, or has another size.
+        UserError: the file is missing or does not decode, is all black, has another size, or may mean either.
     """
-    mask = decode(path)[..., :3].max(axis=2) > 0
+    pixels = decode(path)
+    colors, alphas = pixels[..., :3], pixels[..., 3:]
+    white = float(np.iinfo(pixels.dtype).max)
+    if alphas.size and is_in_alpha(path, _range(colors), _range(alphas), white):
+        mask = alphas[..., 0] > 0
+    else:
+        classes = None if alphas.size else classes_of(path)
+        mask = (colors.max(axis=2) if classes is None else classes) > 0
     if not mask.any():
         raise UserError(f"{path}: the mask is all black, so no pixel is valid; drop the frame")
     if mask.shape[::-1] != size:
@@ -216,6 +224,10 @@ def read_mask(path: Path, image: Path, size: tuple[int, int]) -> np.ndarray:
             "give the mask the image's size"
         )
     return mask
+
+
+def _range(values: np.ndarray) -> tuple[float, float]:
+    return float(values.min()), float(values.max())
 
 
 def is_transparent(pixels: np.ndarray) -> bool:

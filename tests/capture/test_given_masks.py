@@ -8,6 +8,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from PIL import Image
 
 from helpers.films import mask_images
 from scgs_warp.capture import given_masks
@@ -91,6 +92,16 @@ def test_masks_as_programs_write_them(tmp_path, convert, suffix):
     expected = masks_of(tmp_path / "masks", lambda still: still.astype(np.uint8) * 255)
     assert all(mask.sum() == 400 for mask in expected)
     assert np.array_equal(masks_of(tmp_path / "others", convert, suffix), expected)
+
+
+def test_masks_with_a_palette(tmp_path):
+    expected = masks_of(tmp_path / "masks", lambda still: still.astype(np.uint8) * 255)
+    for name in NAMES:
+        still = cv2.imread(str(tmp_path / "masks" / name), cv2.IMREAD_GRAYSCALE) > 128
+        image = Image.fromarray(still.astype(np.uint8), "P")
+        image.putpalette([200, 200, 200, 40, 60, 20])
+        image.save(tmp_path / "masks" / name)
+    assert np.array_equal(read(tmp_path / "masks", Folder(tmp_path / "frames"), range(4), NAMES, SIZE), expected)
 
 
 def test_what_masks_mean_is_decided_for_all_alike(tmp_path):

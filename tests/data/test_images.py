@@ -115,6 +115,34 @@ def test_a_film_may_follow_a_photo(options):
         assert not images.is_complete(np.frombuffer(data[:-end], np.uint8))
 
 
+def palette_mask(file, classes: np.ndarray, colors: list[int]) -> None:
+    image = PillowImage.fromarray(classes, "P")
+    image.putpalette(colors)
+    image.save(file)
+
+
+def test_masks_in_alpha_and_in_palettes(tmp_path):
+    """Without black, the first colour of a palette takes its place; of white masks with alpha, what is transparent."""
+    true = np.array([[False, True, True], [True, False, True]])
+    file, white, alpha = tmp_path / "mask.png", np.full(true.shape, 255, np.uint8), true.astype(np.uint8) * 255
+    kinds = {
+        "LA": lambda: PillowImage.fromarray(np.dstack([white, alpha])).save(file),
+        "RGBA": lambda: PillowImage.fromarray(np.dstack([white] * 3 + [alpha])).save(file),
+        "palette": lambda: palette_mask(file, true.astype(np.uint8), [128, 0, 0, 0, 128, 0]),
+        "palette of nothing": lambda: palette_mask(file, true.astype(np.uint8), [0, 0, 0]),
+        "palette with black": lambda: palette_mask(file, 1 - true.astype(np.uint8), [9, 9, 9, 0, 0, 0]),
+        "colours beside opaque alpha": lambda: PillowImage.fromarray(np.dstack([alpha] * 3 + [white])).save(file),
+    }
+    for kind, write in kinds.items():
+        write()
+        np.testing.assert_array_equal(images.read_mask(file, tmp_path / "image.png", (3, 2)), true, err_msg=kind)
+    palette_mask(file, np.full(true.shape, 1, np.uint8), [128, 0, 0, 0, 128, 0])
+    assert images.read_mask(file, tmp_path / "image.png", (3, 2)).all()
+    PillowImage.fromarray(np.dstack([0 * white] * 3 + [alpha])).save(file)
+    with pytest.raises(UserError, match=r"mask\.png: masks differ in their alpha channel only"):
+        images.read_mask(file, tmp_path / "image.png", (3, 2))
+
+
 def test_a_mask_hides_what_is_black(tmp_path):
     """The darkest grey is valid already, and so is a pixel of a single colour."""
     mask = np.array([[[0, 0, 0], [1, 1, 1], [0, 0, 2]], [[127, 127, 127], [255, 255, 255], [0, 0, 0]]], np.uint8)

@@ -1,0 +1,52 @@
+"""What the pixels of a mask mean: its colours, its alpha channel, or the numbers of a palette's colours."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+
+import numpy as np
+
+from ..errors import UserError
+from ..storage.files import open_regular
+
+Range = tuple[float, float]
+
+
+def classes_of(path: Path) -> np.ndarray | None:
+    """Return the numbers [H, W] of the colours of a palette image, of which none or all are black, as programs
+    write that label objects: 0 takes the place of black. None for other images, whose colours tell."""
+    from PIL import Image
+
+    try:
+        with open_regular(path) as file, Image.open(file) as image:
+            palette = image.getpalette("RGB") if image.mode == "P" else None
+            if palette is None:
+                return None
+            classes = np.asarray(image)
+    except (OSError, ValueError, SyntaxError, TypeError, struct.error, Image.DecompressionBombError):
+        return None  # The decoder reports the damage.
+    used = np.unique(classes)
+    colors = np.zeros((256, 3), np.uint8)
+    colors[: len(palette) // 3] = np.array(palette, np.uint8).reshape(-1, 3)
+    tells_apart = not colors[used].any(axis=1).all() and bool((colors[used] != colors[used[0]]).any())
+    return classes if used[0] == 0 and len(used) > 1 and not tells_apart else None
+
+
+def is_in_alpha(path: Path, colors: Range, alphas: Range, white: float) -> bool:
+    """Return whether masks are in their alpha channel, by the smallest and largest values of colours and of alpha.
+
+    Args:
+        white: value of white by the kind of numbers.
+
+    Raises:
+        UserError: only alpha differs, of black pixels.
+    """
+    if colors[0] < colors[1] or alphas[0] == alphas[1]:
+        return False
+    if colors[0] < white:
+        raise UserError(
+            f"{path}: masks differ in their alpha channel only, and black that is transparent may mean either; save "
+            "them without alpha, black on what does not count and white elsewhere"
+        )
+    return True
