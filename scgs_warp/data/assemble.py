@@ -75,8 +75,8 @@ def assemble(
 ) -> Dataset:
     """Decode every frame once and return the data set.
 
-    Many tools write RGBA files even for images without transparency. Alpha is therefore used only if at least one pixel
-    of one file is less than opaque; otherwise it is dropped, and the frames get border masks and background points.
+    Many tools write RGBA files even for images without transparency. Alpha is therefore used only if at least one file
+    is cut out (:func:`is_transparent`); otherwise it is dropped, and the frames get border masks and background points.
 
     Args:
         one_size: whether to refuse files of different sizes.

@@ -41,6 +41,10 @@ JPEG_MARKER = re.compile(rb"\xff[^\x00\xff\xd0-\xd7]", re.DOTALL)
 JPEG_ALONE, JPEG_END = (0x01, 0xD8), 0xD9
 """Markers that no segment follows, and the one at the end."""
 
+OPAQUE, CUT_OUT = 0.98, 1e-3
+"""Alpha from which a pixel is opaque, and the share of other pixels above which a file is cut out. Programs that resize
+images leave single pixels of alpha 254."""
+
 INSPECTED = 1024
 """Number of bytes by which a file that is no image is recognised."""
 
@@ -62,7 +66,7 @@ class Decoded(NamedTuple):
     source_size: tuple[int, int]
     """(width, height) of the file before the reduction."""
     transparent: bool
-    """True if any pixel of the file is less than opaque."""
+    """True if the file is cut out by alpha."""
     lens: Lens
     """Lens of the file."""
 
@@ -231,8 +235,10 @@ def _range(values: np.ndarray) -> tuple[float, float]:
 
 
 def is_transparent(pixels: np.ndarray) -> bool:
-    """Return whether any pixel of a file [H, W, 3 or 4] is less than opaque."""
-    return pixels.shape[2] == 4 and bool((pixels[..., 3] < np.iinfo(pixels.dtype).max).any())
+    """Return whether a file [H, W, 3 or 4] is cut out by alpha."""
+    if pixels.shape[2] == 3:
+        return False
+    return float((pixels[..., 3] < OPAQUE * np.iinfo(pixels.dtype).max).mean()) > CUT_OUT
 
 
 def decode(path: Path) -> np.ndarray:

@@ -93,6 +93,8 @@ class Survey:
     """Number of cameras, if all frames are of several that stand still and record at the same time."""
     guessed: bool = False
     """True if the distance of the scene from the cameras is a guess."""
+    ends: tuple[float, float] = (0.0, 1.0)
+    """First and last time of a frame."""
 
 
 def survey(data: Dataset) -> Survey:
@@ -134,6 +136,7 @@ def survey(data: Dataset) -> Survey:
         depth_maps=len(data.with_depth),
         standing=len(groups),
         guessed=placed.guessed,
+        ends=(float(instants[0]), float(instants[-1])),
     )
 
 
@@ -247,6 +250,12 @@ def _expectation(facts: Survey, compares_depth: bool) -> str:
         return "good views near the cameras only: how far away the scene is remains a guess, as they look the same way"
     if facts.arc < LITTLE_PARALLAX and not compares_depth:
         return f"good views near the cameras only: they lie within {facts.arc:.1f} degrees, which leaves depth unknown"
+    first, last = facts.ends
+    if max(first, 1.0 - last) > max(GAP * facts.typical_gap, 0.05):
+        return (
+            f"guessed motion before and after the frames, whose times only go from {first:.4g} to {last:.4g}: scale "
+            "them to go from 0 to 1"
+        )
     if facts.gap[1] - facts.gap[0] > max(GAP * facts.typical_gap, 0.05):
         return f"guessed motion from time {facts.gap[0]:.2f} to {facts.gap[1]:.2f}, where there is no frame"
     if facts.flicker > UNSTEADY:

@@ -115,6 +115,19 @@ def test_a_film_may_follow_a_photo(options):
         assert not images.is_complete(np.frombuffer(data[:-end], np.uint8))
 
 
+@pytest.mark.parametrize("kind", [np.uint8, np.uint16])
+def test_files_that_are_cut_out(kind):
+    """Programs that resize images leave single pixels that are not quite opaque."""
+    white = np.iinfo(kind).max
+    pixels = np.full((100, 100, 4), white, kind)
+    assert not images.is_transparent(pixels) and not images.is_transparent(pixels[..., :3])
+    pixels[..., 3] = round(0.997 * white)
+    pixels[0, :10, 3] = 0
+    assert not images.is_transparent(pixels)
+    pixels[0, 10, 3] = white // 2
+    assert images.is_transparent(pixels)
+
+
 def palette_mask(file, classes: np.ndarray, colors: list[int]) -> None:
     image = PillowImage.fromarray(classes, "P")
     image.putpalette(colors)

@@ -137,6 +137,16 @@ def test_a_figure_that_comes_closer_is_no_exposure(background):
     assert survey(data).flicker < 1e-6
 
 
+@pytest.mark.parametrize(
+    ("scale", "said"), [((0.0, 0.1), "only go from 0 to 0.1:"), ((1.0 - 1e-8, 1.0), "from 1 to 1:"), ((0.02, 0.97), "")]
+)
+def test_times_that_cover_a_part(scale, said):
+    first, last = scale
+    frames = [dataclasses.replace(frame, time=first + (last - first) * frame.time) for frame in handheld(41, 2.0)]
+    line = lines(Dataset(frames, folder=Path("part"), split="train"))[1]
+    assert (f"{said} scale them to go from 0 to 1" in line) == bool(said) == ("guessed motion before" in line)
+
+
 def test_a_gap_in_time():
     data = handheld(40)
     frames = [f for f in data if not 0.4 < f.time < 0.7]

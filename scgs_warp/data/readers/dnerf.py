@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 from ...errors import UserError
 from ..assemble import FrameRecord, assemble
@@ -25,8 +26,10 @@ def transforms_path(folder: Path, split: str) -> Path:
 
 
 def recognises(folder: Path) -> bool:
-    """Return whether the folder holds this layout."""
-    return any(transforms_path(folder, split).is_file() for split in ("train", "test", "val"))
+    """Return whether the folder holds this layout. Beside a file of another layout, held-out frames alone do not
+    make it."""
+    there = [split for split in ("train", "test", "val") if transforms_path(folder, split).is_file()]
+    return "train" in there or (bool(there) and not (folder / "transforms.json").is_file())
 
 
 def read(folder: Path, split: str, options: ReadOptions) -> Dataset:
@@ -41,6 +44,8 @@ def read(folder: Path, split: str, options: ReadOptions) -> Dataset:
     entries = content["frames"]
     poses = [read_pose(path, index, entry) for index, entry in enumerate(entries)]
     times = read_times(path, entries)
+    if not shared and split != "train":
+        _check_times(folder, path, entries)
     files = [find_image(path, folder, index, entry) for index, entry in enumerate(entries)]
     if options.only_cameras:
         of_cameras([""] * len(files), options)
@@ -68,6 +73,21 @@ def _path(folder: Path, split: str) -> tuple[Path, bool]:
     if not there and transforms_path(folder, "train").is_file():
         return transforms_path(folder, "train"), True
     return transforms_path(folder, split if split in ("train", *there) else (there or [split])[0]), False
+
+
+def _check_times(folder: Path, path: Path, entries: list[dict[str, Any]]) -> None:
+    """Refuse held-out frames without times beside training frames with times, and the reverse: the order in one file
+    tells nothing of the times in the other."""
+    training = transforms_path(folder, "train")
+    if not training.is_file():
+        return
+    timed, trained = (any("time" in entry for entry in each) for each in (entries, read_transforms(training)["frames"]))
+    if timed != trained:
+        lacks, has = (training, path) if timed else (path, training)
+        raise UserError(
+            f"{lacks}: its frames have no time, but those of {has.name} have; give each frame its time"
+            + (f", or remove {lacks.name} (training frames are then held out)" if lacks == path else "")
+        )
 
 
 def _within_training(folder: Path, path: Path, files: list[Path], times: list[float], options: ReadOptions) -> Choice:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 from pathlib import Path
 
@@ -58,6 +59,40 @@ def test_masks_of_frames(tmp_path):
     edit(tmp_path / "s", lambda content: content["frames"][1].__setitem__("mask_path", "mask.png"))
     data = load(tmp_path / "s", "train")
     assert torch.equal(data[1].mask, torch.from_numpy(mask > 0)) and data[0].mask is None
+
+
+def test_either_all_files_have_times_or_none(tmp_path):
+    """Times by order within one file would not fit those of the other."""
+    scene, test = tmp_path / "s", tmp_path / "s/transforms_test.json"
+    write_scene(scene)
+    timed = test.read_text()
+    content = json.loads(timed)
+    content["frames"][0].pop("time")
+    test.write_text(json.dumps(content))
+    for split in ("test", "val"):
+        with pytest.raises(
+            UserError, match=r"transforms_test\.json: its frames have no time.*or remove transforms_test"
+        ):
+            load(scene, split)
+    assert len(load(scene, "train")) == 3
+    edit(scene, lambda content: [frame.pop("time") for frame in content["frames"]])
+    assert load(scene, "test").times.tolist() == [0.0]
+    test.write_text(timed)
+    with pytest.raises(
+        UserError, match=r"transforms_train\.json: its frames have no time, but those of transforms_test"
+    ):
+        load(scene, "test")
+
+
+@pytest.mark.parametrize("split", ["test", "val"])
+def test_held_out_frames_alone_hide_no_other_layout(split, tmp_path):
+    write_scene(tmp_path / "s")
+    lone = tmp_path / f"s/transforms_{split}.json"
+    (tmp_path / "s/transforms_test.json").rename(lone)
+    (tmp_path / "s/transforms_train.json").rename(tmp_path / "s/transforms.json")
+    assert len(load(tmp_path / "s", "train")) == 2  # one of three is held out
+    (tmp_path / "s/transforms.json").unlink()
+    assert len(load(tmp_path / "s", split)) == 1
 
 
 def frame_field(key, value):
