@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import hashlib
 import json
+import os
 import re
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -14,12 +15,14 @@ from typing import Any
 from ..errors import UserError
 from ..storage.files import read_text
 from ..storage.json_files import parse_json
+from ..storage.locks import AlreadyLocked, lock_file
 from .writing import FILE, write_text
 
 WORK = "work"
 """Folder of intermediate files; it may be deleted when the data set is complete."""
 JOURNAL = "journal.json"
-LEFT = re.compile(r"\.journal\.json\.\w+\.tmp")
+LOCK = ".lock"
+LEFT = re.compile(r"\.journal\.json\.\w+\.tmp|\.lock")
 """Names of what a killed writer of the journal leaves."""
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EROFS)
 
@@ -28,11 +31,11 @@ class Journal:
     """Chain of stages. A stage's result is reused if the settings of the stage and of all earlier stages are
     unchanged."""
 
-    def __init__(self, folder: Path, source: str, marker: str = FILE) -> None:
+    def __init__(self, folder: Path, digest: Callable[[bool], str], marker: str = FILE) -> None:
         """
         Args:
             folder: must not exist, or be empty, or hold work on the same source.
-            source: digest of the source.
+            digest: returns the digest of the source, or that of earlier versions.
             marker: file whose presence marks a finished folder.
 
         Raises:
@@ -41,12 +44,22 @@ class Journal:
         self.folder = folder
         self.work = folder / WORK
         self.file = self.work / JOURNAL
-        self._source = self._key = hashlib.sha256(source.encode()).hexdigest()
+        self._marker, self._digest = marker, digest
+        self._source = _hashed(digest(False))
+        self.earlier = False
+        """True if the folder holds work of an earlier version, which digested sources in another way."""
+        self._load()
+
+    def _load(self) -> None:
+        """Read what the folder holds."""
+        folder = self.folder
         self._stages: dict[str, dict[str, Any]] = {}
         if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
             content = {"source": self._source, "stages": {}} if self._is_bare() else _read(self.file)
             if content is None:
                 raise UserError(f"{folder}: exists and holds something else; give another --output, or remove it")
+            if content.get("source") != self._source:
+                self._source, self.earlier = _hashed(self._digest(True)), True
             if content.get("source") != self._source:
                 raise UserError(
                     f"{folder}: holds the capture of another video; give another --output, or remove the folder"
@@ -54,7 +67,8 @@ class Journal:
             self._stages = {
                 name: entry for name, entry in content["stages"].items() if isinstance(entry, dict) and "key" in entry
             }
-        self.finished = (folder / marker).exists()
+        self._key = self._source
+        self.finished = (folder / self._marker).exists()
 
     def _is_bare(self) -> bool:
         """Return whether the folder holds only what an attempt leaves that ends before its first entry: on a full disk,
@@ -63,15 +77,34 @@ class Journal:
             return False
         return self.work.is_dir() and all(LEFT.fullmatch(path.name) for path in self.work.iterdir())
 
-    def start(self) -> None:
-        """Make the folder."""
+    @contextmanager
+    def started(self) -> Iterator[None]:
+        """Make the folder, and keep other processes from working in it for the duration of the context.
+
+        Raises:
+            UserError: another process works in it, or it cannot be made.
+        """
         try:
             self.work.mkdir(parents=True, exist_ok=True)
-            self._save()
-        except OSError as error:
+            lock = lock_file(self.work / LOCK)
+        except AlreadyLocked:
             raise UserError(
-                f"{self.folder}: cannot be written ({error.strerror}); choose another --output, or make room"
+                f"{self.folder}: another capture is running here; wait for it, or give another --output"
             ) from None
+        except OSError as error:
+            raise self._unwritable(error) from None
+        try:
+            self._load()  # another process may have been at work
+            try:
+                self._save()
+            except OSError as error:
+                raise self._unwritable(error) from None
+            yield
+        finally:
+            os.close(lock)
+
+    def _unwritable(self, error: OSError) -> UserError:
+        return UserError(f"{self.folder}: cannot be written ({error.strerror}); choose another --output, or make room")
 
     def stage(self, name: str, settings: Any, make: Callable[[], Any], clear: Callable[[], None]) -> Any:
         """Return the result of a stage: the stored result, or a new one.
@@ -84,7 +117,7 @@ class Journal:
         Raises:
             UserError: the folder was finished with other settings.
         """
-        self._key = hashlib.sha256((self._key + json.dumps([name, settings], sort_keys=True)).encode()).hexdigest()
+        self._key = _hashed(self._key + json.dumps([name, settings], sort_keys=True))
         stored = self._stages.get(name)
         if stored is not None and stored["key"] == self._key and "result" in stored:
             return stored["result"]
@@ -135,6 +168,10 @@ def disk_errors(folder: Path) -> Iterator[None]:
             f"{folder}: cannot be written ({error.strerror}); make room, and give the same command again (finished "
             "work is kept)"
         ) from None
+
+
+def _hashed(text: str) -> str:
+    return hashlib.sha256(text.encode()).hexdigest()
 
 
 def _read(file: Path) -> dict[str, Any] | None:

@@ -144,7 +144,9 @@ def capture(
     if request.masks not in ("auto", "none"):
         open_source(Path(request.masks))
     with disk_errors(folder):
-        return _capture(request, source, Journal(folder, source.digest()), device, show)
+        journal = Journal(folder, source.digest)
+        with journal.started():
+            return _capture(request, source, journal, device, show)
 
 
 def _capture(
@@ -152,7 +154,6 @@ def _capture(
 ) -> CaptureResult:
     """Run or resume all stages."""
     folder, before = journal.folder, journal.finished
-    journal.start()
     frames = _frames(request, source, journal, show)
     _enough(request, frames)
     frame_files = _masks(request, source, frames, journal, show)
@@ -284,7 +285,7 @@ def _masks(
                 bar.advance()
         return {"share": float(np.mean(shares))}
 
-    kind = "auto" if request.masks == "auto" else open_source(path).digest()
+    kind = "auto" if request.masks == "auto" else open_source(path).digest(journal.earlier)
     journal.stage("masks", kind, make, lambda: shutil.rmtree(mask_folder, ignore_errors=True))
     return FrameFiles(folder, files, mask_folder)
 

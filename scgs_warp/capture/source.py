@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Container, Iterator
+from collections.abc import Container, Iterator, Sequence
 from itertools import islice, pairwise
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
@@ -20,8 +20,7 @@ from .frame_times import REORDERED, rising
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
 DIGEST_BYTES = 1 << 20
-"""Number of bytes at the beginning and at the end of a file that enter its digest; videos are too large to hash
-completely."""
+"""Number of bytes of a file that are hashed at a time. Digests of earlier versions saw as many at both ends only."""
 SAMPLE = 100
 """Number of stored pictures that show whether they have times of display."""
 
@@ -58,8 +57,9 @@ class Source(Protocol):
         """
         ...
 
-    def digest(self) -> str:
-        """Return a hash that identifies the source."""
+    def digest(self, earlier: bool = False) -> str:
+        """Return a hash that identifies the source; with ``earlier``, the one of earlier versions, which saw both ends
+        of large files only."""
         ...
 
 
@@ -141,8 +141,8 @@ class Video:
         if self.incomplete is not None and self.incomplete.useless:
             raise UserError(f"{self.path}: only {self.incomplete.describe()}")
 
-    def digest(self) -> str:
-        return _digest([self.path])
+    def digest(self, earlier: bool = False) -> str:
+        return _digest_of_ends([self.path]) if earlier else _digest([self.path])
 
 
 class _Read:
@@ -236,8 +236,10 @@ class Folder:
                 )
             yield SourceFrame(index, self.moments[index], shrunk(image, longest), file.name)
 
-    def digest(self) -> str:
-        return _digest(self.files)
+    def digest(self, earlier: bool = False) -> str:
+        if earlier:
+            return _digest_of_ends(self.files)
+        return _digest(self.files, [file.name for file in self.files])
 
 
 def _moments(names: list[str]) -> list[float]:
@@ -286,8 +288,19 @@ def shrunk(image: np.ndarray, longest: int) -> np.ndarray:
     return cv2.resize(image, size, interpolation=cv2.INTER_AREA)
 
 
-def _digest(files: list[Path]) -> str:
-    """Hash the sizes and both ends of the files; their names and dates do not matter."""
+def _digest(files: list[Path], names: Sequence[str] = ()) -> str:
+    """Hash the content of files, and names, which tell times; dates do not matter."""
+    digest = hashlib.sha256("/".join(names).encode())  # no name has a slash
+    for file in files:
+        digest.update(f"/{file.stat().st_size},".encode())
+        with file.open("rb") as content:
+            while part := content.read(DIGEST_BYTES):
+                digest.update(part)
+    return digest.hexdigest()
+
+
+def _digest_of_ends(files: list[Path]) -> str:
+    """Hash the sizes and both ends of the files, as earlier versions did."""
     digest = hashlib.sha256()
     for file in files:
         size = file.stat().st_size

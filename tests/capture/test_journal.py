@@ -11,15 +11,20 @@ from scgs_warp.capture.journal import Journal
 from scgs_warp.errors import UserError
 
 
+def start(folder) -> None:
+    with Journal(folder, lambda earlier: "film").started():
+        pass
+
+
 def test_the_journal_does_work_once(tmp_path):
     made: list[str] = []
 
     def run(folder, source="film", **settings):
-        journal = Journal(folder, source)
-        journal.start()
-        for name in ("a", "b"):
-            value = settings.get(name, 0)
-            journal.stage(name, value, lambda n=name, v=value: made.append(f"{n}{v}") or {"v": v}, lambda: None)
+        journal = Journal(folder, lambda earlier: source)
+        with journal.started():
+            for name in ("a", "b"):
+                value = settings.get(name, 0)
+                journal.stage(name, value, lambda n=name, v=value: made.append(f"{n}{v}") or {"v": v}, lambda: None)
         return journal
 
     run(tmp_path / "x")
@@ -45,15 +50,36 @@ def test_an_attempt_that_ended_before_its_first_entry_is_no_obstacle(tmp_path, m
     disk = FakeDisk(monkeypatch, ("journal.json",))
     disk.full = True
     with pytest.raises(UserError, match=r"journal\.json: cannot be written \(No space left on device\)"):
-        Journal(tmp_path / "out", "film").start()
+        start(tmp_path / "out")
     assert (tmp_path / "out/work").is_dir()
     disk.full = False
     (tmp_path / "out/work/.journal.json.0a1b2c3d.tmp").write_bytes(b"")
-    Journal(tmp_path / "out", "film").start()
-    assert [path.name for path in (tmp_path / "out/work").iterdir()] == ["journal.json"]
-    Journal(tmp_path / "out", "film").start()
+    start(tmp_path / "out")
+    assert [path.name for path in (tmp_path / "out/work").iterdir() if path.name != ".lock"] == ["journal.json"]
+    start(tmp_path / "out")
     for name in ("letter.txt", "work/letter.txt"):
         (tmp_path / f"{name[0]}/work").mkdir(parents=True)
         (tmp_path / name[0] / name).write_text("dear")
         with pytest.raises(UserError, match="something else"):
-            Journal(tmp_path / name[0], "film")
+            start(tmp_path / name[0])
+
+
+def test_two_captures_do_not_share_a_folder(tmp_path):
+    one, two = (Journal(tmp_path / "out", lambda earlier: "film") for _ in range(2))
+    with one.started():
+        with pytest.raises(UserError, match="out: another capture is running here; wait for it"), two.started():
+            pass
+        one.stage("a", 0, lambda: 1, dict)
+    with two.started():
+        assert two.stage("a", 0, lambda: 2, dict) == 1, "what the other has done meanwhile counts"
+
+
+def test_work_of_earlier_versions_goes_on(tmp_path):
+    """They identified a source by another digest."""
+    old = Journal(tmp_path / "out", lambda earlier: "old")
+    with old.started():
+        old.stage("a", 0, lambda: 1, dict)
+    new = Journal(tmp_path / "out", lambda earlier: "old" if earlier else "new")
+    with new.started():
+        assert new.earlier and new.stage("a", 0, lambda: 2, dict) == 1
+    assert not Journal(tmp_path / "other", lambda earlier: "old" if earlier else "new").earlier

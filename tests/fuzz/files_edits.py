@@ -94,18 +94,22 @@ def _result() -> dict[str, Any]:
 
 
 def write_journal(folder: Path) -> None:
-    journal = Journal(folder, "a film")
-    journal.start()
+    journal = Journal(folder, lambda earlier: "a film")
     settings = dict.fromkeys(("frames", "start", "end"), None) | {"size": 1280}
-    journal.stage("frames", settings, _result, lambda: None)
-    journal.stage("masks", "auto", lambda: {"share": 0.2}, lambda: None)
-    journal.stage("cameras", 0, lambda: 3, lambda: None)
+    with journal.started():
+        journal.stage("frames", settings, _result, lambda: None)
+        journal.stage("masks", "auto", lambda: {"share": 0.2}, lambda: None)
+        journal.stage("cameras", 0, lambda: 3, lambda: None)
 
 
 def load_journal(folder: Path) -> None:
     """Resume as ``apps/capture.py`` does, which makes unusable files again."""
-    journal = Journal(folder, "a film")
-    journal.start()
+    journal = Journal(folder, lambda earlier: "a film")
+    with journal.started():
+        _resume(journal)
+
+
+def _resume(journal: Journal) -> None:
     source = SimpleNamespace(count=9, video=True, path=Path("film.mp4"))
     before, pipeline._choose = pipeline._choose, lambda *_: (_ for _ in ()).throw(_Again)  # type: ignore[assignment]
     try:

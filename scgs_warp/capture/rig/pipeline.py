@@ -67,7 +67,9 @@ def capture_rig(request: RigRequest, folder: Path, *, device: str = "cpu", show:
     check(request, names)
     known = known_cameras(request.folder, files)
     with disk_errors(folder):
-        return _capture(_Rig(request, folder, files, FILE if known is None else POSES, device, show), known)
+        rig = _Rig(request, folder, files, FILE if known is None else POSES, device, show)
+        with rig.journal.started():
+            return _capture(rig, known)
 
 
 def _capture(rig: _Rig, known: KnownCameras | None) -> RigResult:
@@ -78,7 +80,6 @@ def _capture(rig: _Rig, known: KnownCameras | None) -> RigResult:
     """
     request, folder, files, names, show = rig.request, rig.folder, rig.files, rig.names, rig.show
     before = rig.journal.finished
-    rig.journal.start()
     starts = [0.0] * len(files) if known is not None and request.offsets is None else rig.starts()
     line = rig.frames(starts, everything=known is not None)
     if known is not None:
@@ -116,10 +117,12 @@ class _Rig:
         self.names = [file.stem for file in files]
         self.device, self.show = device, show
         self.videos = [Video(file) for file in files]
-        digest = hashlib.sha256("".join(video.digest() for video in self.videos).encode()).hexdigest()
-        self.journal = Journal(folder, digest, marker)
+        self.journal = Journal(folder, self._digest, marker)
         self.work = self.journal.work
         self.recorded: list[Recorded] = []
+
+    def _digest(self, earlier: bool) -> str:
+        return hashlib.sha256("".join(video.digest(earlier) for video in self.videos).encode()).hexdigest()
 
     def starts(self) -> list[float]:
         """Return the seconds at which the cameras begin: the given ones, or those found by sound."""

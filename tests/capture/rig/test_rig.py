@@ -246,8 +246,8 @@ def test_frames_of_other_containers_have_their_moments(tmp_path, kind):
     for file in files:
         encoded(file, 40)
     rig = pipeline._Rig(RigRequest(files[0].parent), tmp_path / "out", files, "x", "cpu", silent)
-    rig.journal.start()
-    line = rig.frames([0.0, 0.08], everything=False)
+    with rig.journal.started():
+        line = rig.frames([0.0, 0.08], everything=False)
     np.testing.assert_allclose(line.moments, np.tile(np.arange(38) / 25, (2, 1)), atol=1e-9)
     shown = list(Video(files[1]).frames(1280))
     assert all(np.array_equal(rig.picture(1, instant), shown[instant].image) for instant in range(38))
@@ -262,8 +262,8 @@ def test_films_that_are_cut_off_or_damaged(tmp_path):
     content = (source / "a.mp4").read_bytes()
     (source / "a.mp4").write_bytes(content[: 6 * len(content) // 10])
     rig = pipeline._Rig(RigRequest(source), tmp_path / "out", [source / "a.mp4", source / "b.mp4"], "x", "cpu", silent)
-    rig.journal.start()
-    line = rig.frames([0.0, 0.0], everything=False)
+    with rig.journal.started():
+        line = rig.frames([0.0, 0.0], everything=False)
     assert 1.0 < line.seconds[-1] < 3.5 and len(rig.cut_off()) == 1
     assert re.search(r"a\.mp4: \d\d of 100 frames can be decoded, until second", rig.cut_off()[0])
     spoil(source / "b.mp4", 0.25, 0.1)
