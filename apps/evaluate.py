@@ -30,13 +30,16 @@ class Options:
     """Frames to score; training frames are rendered from their refined poses if training refined them."""
     data: Path | None = None
     """Folder of the data set, if it has moved since training."""
+    background: Literal["black", "white"] | None = None
+    """Colour behind a subject that is cut out; by default that of the training images. Another one shows what training
+    left beside the subject; its files go to RUN/evaluation/SPLIT-COLOUR."""
     lpips_weights: Path | None = None
     """File with VGG16 and LPIPS weights; without it LPIPS is not measured."""
     fit_color: bool = False
     """Also score each image with the affine colour (exposure, white balance) that fits it best. A run with
     optim.frame_colors is always scored so, and with the colours of the training frames before and after."""
     json: Path | None = None
-    """File for the metrics; RUN/evaluation/SPLIT/metrics.json by default, with --also SPLIT-mean."""
+    """File for the metrics; by default metrics.json in RUN/evaluation/SPLIT, with --also in SPLIT-mean."""
     device: Device = "auto"
     """Where to render; auto takes a GPU if there is one."""
     threads: int | None = None
@@ -47,10 +50,11 @@ class Options:
 
 
 def load_data(scene: Scene, options: Options) -> Dataset:
-    """Load the split with the size, the background and the choice of the training images.
+    """Load the split with the size, the choice and, unless another is given, the background of the training images.
 
     Raises:
-        UserError: the run does not name its data folder, the folder is missing, or it has no such split.
+        UserError: the run does not name its data folder, the folder is missing, or it has no such split; or a
+            background is given, and no image has alpha.
     """
     from scgs_warp import data
     from scgs_warp.config.fields import IMAGE_SETTINGS
@@ -63,7 +67,12 @@ def load_data(scene: Scene, options: Options) -> Dataset:
     kept = {key: settings[key] for key in IMAGE_SETTINGS if key in settings}
     if options.data is None and not Path(folder).is_dir():
         raise UserError(f"{folder}: the run's data are no longer there; say where they lie with --data DIR")
-    return data.load(folder, options.split, **kept)
+    if options.background is not None:
+        kept["background"] = options.background
+    dataset = data.load(folder, options.split, **kept)
+    if options.background is not None and not dataset.with_alpha:
+        raise UserError(f"--background {options.background}: the images of {folder} have no alpha; leave it out")
+    return dataset
 
 
 def other_images(run: Path, dataset: Dataset) -> str | None:
@@ -139,7 +148,8 @@ def main(args: list[str] | None) -> None:
 
         lpips = LPIPS(options.lpips_weights, device)
     dataset = load_data(scene, options)
-    notes = [*dataset.notes, *filter(None, [other_images(options.run, dataset)])]
+    recolored = dataset.background != scene.settings.get("data", {}).get("background", dataset.background)
+    notes = [*dataset.notes, *filter(None, [None if recolored else other_images(options.run, dataset)])]
     print("\n".join(notes), end="\n" if notes else "")
     poses = "given"
     if options.split == "train":
@@ -147,7 +157,8 @@ def main(args: list[str] | None) -> None:
 
         corrected = refined(dataset, options.run, scene.normalisation)
         dataset, poses = (dataset, poses) if corrected is None else (corrected, "refined")
-    folder = options.run / "evaluation" / (f"{options.split}-mean" if options.also else options.split)
+    kinds = [options.split, *(["mean"] if options.also else []), *([dataset.background] if recolored else [])]
+    folder = options.run / "evaluation" / "-".join(kinds)
     known = [seconds for run in runs if (seconds := training_seconds(run)) is not None]
     with progress(len(dataset), "evaluate") as shown:
         metrics = metrics_of(

@@ -255,7 +255,8 @@ def metrics_of(
         "motion": scene.motion_name,
         "device": torch.device(getattr(scene, "device", "cpu")).type,
         "data": str(dataset.folder),
-        **{key: data.get(key) for key in ("downscale", "resample", "background")},
+        **{key: data.get(key) for key in ("downscale", "resample")},
+        "background": dataset.background,
         **{key: data[key] for key in ("frames", "only_cameras") if data.get(key)},
         "seed": scene.settings.get("seed"),
     }

@@ -46,3 +46,26 @@ def test_the_mean_of_two_runs(trained, other_seed, tmp_path):
     assert metrics["psnr"] != alone["psnr"] and metrics["gaussians"] > alone["gaussians"]
     assert metrics["runs"] == [str(trained), str(other_seed)] and metrics["seconds"] > alone["seconds"]
     assert (trained / "evaluation/test-mean/contact_sheet.png").is_file()
+
+
+def test_another_background_shows_what_lies_beside_the_subject(trained, tmp_path):
+    alone = json.loads((trained / "metrics.json").read_text())
+    done = run_app("evaluate", "--run", str(trained), "--background", "white", "--device", "cpu")
+    assert done.returncode == 0 and "are not those" not in done.stdout, done.stderr
+    folder = trained / "evaluation/test-white"
+    metrics = json.loads((folder / "metrics.json").read_text())
+    assert metrics["background"] == "white" and metrics["psnr"] != alone["psnr"]
+    for name in ("renders", "truth"):
+        corner = cv2.imread(str(min((folder / name).glob("*.png"))))[0, 0]
+        assert (corner == 255).all(), name
+
+
+def test_a_background_of_filled_images_is_refused(dnerf, trained, tmp_path):
+    filled = tmp_path / "filled"
+    shutil.copytree(dnerf, filled)
+    for path in filled.glob("*/*.png"):
+        cv2.imwrite(str(path), cv2.imread(str(path)))
+    where = "--run", str(trained), "--data", str(filled), "--background", "white", "--device", "cpu"
+    done = run_app("evaluate", *where)
+    line = f"error: --background white: the images of {filled} have no alpha; leave it out"
+    assert done.returncode == 2 and line in done.stderr, done.stderr
