@@ -24,6 +24,9 @@ def main(args: list[str] | None = None) -> int:
         "--row", required=True, help="name of the row, as quality_tables.py or the reported runs have it"
     )
     parser.add_argument("--scene", required=True)
+    parser.add_argument(
+        "--white", action="store_true", help="also keep the scores of `apps/evaluate.py --run RUN --background white`"
+    )
     parser.add_argument("--results", type=Path, default=RESULTS, help="folder of the JSON files")
     options = parser.parse_args(args)
     try:
@@ -50,6 +53,9 @@ def main(args: list[str] | None = None) -> int:
         "processor": processor,
         **{key: value for key, value in metrics.items() if key not in ("per_image", "data")},
     }
+    if options.white:
+        scored = json.loads((options.run / "evaluation" / "test-white" / "metrics.json").read_text(encoding="utf-8"))
+        run.update({f"{key}_white": scored[key] for key in ("psnr", "psnr_worst")})
     path = options.results / "quality" / f"{options.table}-{options.row}-{options.scene}.json"
     path.write_text(json.dumps(run, indent=2) + "\n", encoding="utf-8")
     print(path)

@@ -37,17 +37,26 @@ def change_of_defaults(source: Source) -> str:
 
 
 def backgrounds(source: Source) -> str:
-    """Write scores and the alpha outside the subject, without and with a background that changes in the main stage."""
+    """Write scores on black and on white, and the alpha outside the subject, without and with a background that changes
+    in the main stage."""
     both = ("before", "after")
+    scores = {"": "psnr", "worst image, ": "psnr_worst", "on white, ": "psnr_white"}
     rows = []
-    for scene in (*ZOO, "figure", "player"):
+    for scene in (*ZOO, "rods-seed-1", "figure", "player"):
         if all(source.run(row, scene) for row in both):
-            before, after = (source.run(row, scene) for row in both)
-            scores = [number(run[key], 2) for key in ("psnr", "psnr_worst") for run in (before, after)]
-            outside = [percent(100 * run["extra"], 3) for run in (before, after)]
-            rows.append([scene, *scores, *outside, *(thousands(run["gaussians"], 1) for run in (before, after))])
+            runs = [source.run(row, scene) for row in both]
+            cells = [number(run[key], 2) if key in run else "" for key in scores.values() for run in runs]
+            outside = [percent(100 * run["extra"], 3) for run in runs]
+            rows.append(
+                [
+                    scene.replace("-seed-", ", seed "),
+                    *cells,
+                    *outside,
+                    *(thousands(run["gaussians"], 1) for run in runs),
+                ]
+            )
     marked = [source.label(row, row) for row in both]
-    heads = ("", "worst image, ", "alpha outside the subject, ", "Gaussians, ")
+    heads = (*scores, "alpha outside the subject, ", "Gaussians, ")
     return table(["", *(head + text for head in heads for text in marked)], rows)
 
 
