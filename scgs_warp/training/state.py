@@ -127,14 +127,13 @@ class TrainState:
     @staticmethod
     def begin(config: TrainConfig, data: Dataset, device: str) -> TrainState:
         """Make the state at step 0."""
-        placed = place(data)
-        normalisation = placed.normalisation
+        normalisation, view, _ = place(data)
         config = resolve_auto(config, data)
         initial = _initial_points(config, data, normalisation)
         points, colors = initial.points.to(device), initial.colors.to(device)
         # Cameras that stand still have no extent; the extent of the content is used instead.
         extent = max(data.extent * normalisation.scale, COMMON_RADIUS)
-        rest = (normalisation, placed.overview, extent, points, colors)
+        rest = (normalisation, view, extent, points, colors)
         identity = {"fingerprint": data.fingerprint, "frames": len(data), "data": data}
         if config.pretrain_steps > 0:
             wide = THICKEST * half_thickness(data, normalisation) if config.pretrain.silhouette > 0 else math.inf
