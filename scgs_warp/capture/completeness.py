@@ -3,10 +3,17 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from typing import Any, NamedTuple
+
+import numpy as np
 
 LOST_SHARE, LOST_FRAMES = 0.02, 8
 """Share and number of the frames that may be missing: encoders and trimming leave out a few."""
+EVEN = 0.9
+"""Least share of the times between frames that are about the usual one, for a film of an even rate."""
+MOST_LOST = 4
+"""Largest number of lost frames for each that is left; beyond it, the film rests most of the time."""
 HARDLY_ANY = 0.05
 """Share of the frames below which a film is refused."""
 
@@ -65,8 +72,19 @@ def _stated(text: str) -> float:
     return int(parts[1]) * 3600.0 + int(parts[2]) * 60.0 + float(parts[3]) if parts else 0.0
 
 
+def lost_in_gaps(seconds: Sequence[float]) -> int:
+    """Return the number of frames that are missing where a film of an even rate has none for long, by the times of the
+    others: damage of .mkv and .ts leaves such gaps. A film that rests for most of its time has lost none."""
+    steps = np.diff(np.asarray(seconds, np.float64))
+    usual = float(np.median(steps)) if len(steps) else 0.0
+    if usual <= 0.0 or (steps < 1.5 * usual).mean() < EVEN:
+        return 0
+    lost = round(float((steps[steps > LOST_FRAMES * usual] / usual - 1.0).sum()))
+    return lost if lost < MOST_LOST * len(seconds) else 0
+
+
 def incomplete(
-    header: Header, rate: float, *, decoded: int, hidden: int, seconds: float, latest: float
+    header: Header, rate: float, *, decoded: int, hidden: int, seconds: float, latest: float, lost: int = 0
 ) -> Incomplete | None:
     """Compare what is there with the header; return None if nothing noteworthy is missing.
 
@@ -76,10 +94,13 @@ def incomplete(
         hidden: number of stored pictures that an edit list cuts off.
         seconds: time of the last frame, from that of the first.
         latest: the same on the file's clock.
+        lost: number of frames that are missing in gaps, which counts if the header does not count frames.
     """
     announced = header.frames - hidden if header.counted else header.frames
     until_end = round((header.seconds - max(seconds, latest)) * rate) - 1
     missing = announced - decoded if header.counted else until_end
     most = max(LOST_FRAMES, LOST_SHARE * announced)
     interlaced = until_end <= most and abs(announced - 2 * decoded) <= most  # Each half of a frame may be stored alone.
-    return Incomplete(decoded, announced, seconds) if missing > most and not interlaced else None
+    if missing > most and not interlaced:
+        return Incomplete(decoded, announced, seconds)
+    return Incomplete(decoded, decoded + lost, seconds) if lost and not header.counted else None

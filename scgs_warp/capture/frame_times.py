@@ -40,12 +40,14 @@ def _sorted(frames: Iterable[tuple[Frame, float | None]], rate: float, delay: in
     """Yield frames in order, with the smallest times of those held back, and with times where there are none."""
     waiting: deque[Frame] = deque()
     times: list[float] = []
-    known, since = 0.0, 0
+    known, since, strayed = 0.0, 0, False
     for frame, second in frames:
         if second is None:
             second = known + since / rate
         else:
-            known, since = second, 0
+            strayed = second < known - ANEW and not strayed
+            if not strayed:  # unknown times do not follow a straggler
+                known, since = second, 0
         since += 1
         waiting.append(frame)
         heappush(times, second)

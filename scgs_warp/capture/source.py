@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from array import array
 from collections.abc import Container, Iterator, Sequence
 from itertools import islice, pairwise
 from pathlib import Path
@@ -15,7 +16,7 @@ from ..data.images import is_complete, oversized_claim, size_text
 from ..data.name_times import moments_in_names
 from ..data.natural_order import natural
 from ..errors import UserError
-from .completeness import Incomplete, header_of, incomplete
+from .completeness import Incomplete, header_of, incomplete, lost_in_gaps
 from .frame_times import REORDERED, rising
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
@@ -120,7 +121,7 @@ class Video:
             stream = container.streams.video[0]
             stream.thread_type = "SLICE"  # Threads of frames lose more or fewer of those before a damaged one.
             shape = float(stream.sample_aspect_ratio or 1)
-            size, last = None, 0.0
+            size, last, times = None, 0.0, array("d")
             frames = rising(read.frames(container, stream), self.rate, self._delay)
             for index, (frame, seconds) in enumerate(frames):
                 if wanted is None or index in wanted:
@@ -133,10 +134,17 @@ class Video:
                         )
                     yield SourceFrame(index, seconds, _picture(frame, longest, shape), "")
                 last = seconds
+                times.append(seconds)
         if read.decoded == 0:
             raise UserError(f"{self.path}: no frame can be decoded; save it as .mp4, or give a folder of images")
         self.incomplete = incomplete(
-            self._header, self.rate, decoded=read.decoded, hidden=read.hidden, seconds=last, latest=read.latest
+            self._header,
+            self.rate,
+            decoded=read.decoded,
+            hidden=read.hidden,
+            seconds=last,
+            latest=read.latest,
+            lost=lost_in_gaps(times),
         )
         if self.incomplete is not None and self.incomplete.useless:
             raise UserError(f"{self.path}: only {self.incomplete.describe()}")

@@ -10,7 +10,8 @@ import numpy as np
 import pytest
 
 from helpers.films import cut_film, encoded, pan, spoil
-from scgs_warp.capture.completeness import Header, Incomplete, header_of, incomplete
+from scgs_warp.capture.completeness import Header, Incomplete, header_of, incomplete, lost_in_gaps
+from scgs_warp.capture.rig.instants import recorded
 from scgs_warp.capture.source import Video
 from scgs_warp.errors import UserError
 
@@ -43,6 +44,29 @@ def test_damage_within_a_film_is_noticed(tmp_path):
     spoil(path, 0.5, 0.25)
     decoded, found = read(path)
     assert found is not None and found.decoded == decoded < 90 and found.seconds > 3.8
+
+
+@pytest.mark.parametrize("kind", ["mkv", "ts"])
+def test_damage_that_leaves_a_gap_is_noticed(tmp_path, kind):
+    """These containers do not count their frames, and skip what is damaged."""
+    path = tmp_path / f"film.{kind}"
+    encoded(path, FRAMES, gop=20)
+    assert read(path) == (FRAMES, None)
+    spoil(path, 0.5, 0.2)
+    decoded, found = read(path)
+    assert found is not None and found.decoded == decoded < 85 and found.announced in (FRAMES, FRAMES + 1)
+    there = recorded(path).incomplete
+    assert there is not None and abs(there.decoded - decoded) <= 1
+
+
+def test_gaps_in_an_even_rate():
+    even = np.arange(100) / 25
+    assert lost_in_gaps(even) == lost_in_gaps([]) == lost_in_gaps([1.0]) == lost_in_gaps([1.0] * 5) == 0
+    assert lost_in_gaps(even[::20]) == 0
+    assert lost_in_gaps(np.delete(even, range(40, 60))) == 20
+    assert lost_in_gaps(np.delete(even, range(40, 47))) == 0, "encoders leave out a few"
+    assert lost_in_gaps(np.cumsum(np.tile([0.04, 0.04, 0.04, 0.5], 20))) == 0, "an uneven rate"
+    assert lost_in_gaps(np.concatenate([even, even + 3600.0])) == 0, "a film that rests"
 
 
 def test_a_film_of_which_hardly_anything_is_left_is_refused(tmp_path):

@@ -34,6 +34,7 @@ def test_unknown_times_follow_the_rate():
 def test_times_never_fall():
     assert times([0.0, 0.04, 0.03, 0.08]) == [0.0, 0.04, 0.04, 0.08]
     assert times([0.0, 5.0, 2.0, 5.1]) == [0.0, 5.0, 5.0, 5.1], "a straggler"
+    assert times([0.0, 3.0, 1.0, None, 3.12]) == pytest.approx([0.0, 3.0, 3.0, 3.08, 3.12]), "of damage"
     anew = times([9.0, 9.04, 9.08, 0.0, 0.04, 0.08, 0.5])
     assert anew == pytest.approx([0.0, 0.04, 0.08, 0.08, 0.12, 0.16, 0.58])
 

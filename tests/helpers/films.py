@@ -62,18 +62,34 @@ def cut_film(path: Path, to: Path, count: int) -> None:
                 out.mux(packet)
 
 
-def encoded(path: Path, count: int, options: dict[str, str] | None = None, sound: float = 0.0) -> None:
+def without_beginning(path: Path, to: Path, count: int) -> None:
+    """Copy a film without its first ``count`` stored pictures, as recordings of broadcasts begin."""
+    import av
+
+    with av.open(str(path)) as film, av.open(str(to), "w") as out:
+        source = film.streams.video[0]
+        target = out.add_stream_from_template(source)
+        for packet in [packet for packet in film.demux(source) if packet.size][count:]:
+            packet.stream = target
+            out.mux(packet)
+
+
+def encoded(
+    path: Path, count: int, options: dict[str, str] | None = None, sound: float = 0.0, gop: int | None = None
+) -> None:
     """Write a film of H.264 with reordered frames, 25 a second, of a noisy pan over the wall.
 
     Args:
         options: of the container.
         sound: length of a silent sound track, seconds; 0 for none.
+        gop: number of frames from one key frame to the next; None: as the encoder chooses.
     """
     import av
 
     rng = np.random.default_rng(0)
     with av.open(str(path), "w", options=options or {}) as out:
-        stream = out.add_stream("libx264", rate=25)
+        keys = {} if gop is None else {"g": str(gop), "keyint_min": str(gop), "sc_threshold": "0"}
+        stream = out.add_stream("libx264", rate=25, options=keys)
         stream.width, stream.height, stream.pix_fmt = 160, 120, "yuv420p"
         track = out.add_stream("aac", rate=48000) if sound else None
         for picture in pan(range(0, 2 * count, 2)):

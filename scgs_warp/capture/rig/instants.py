@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ...errors import UserError
-from ..completeness import Incomplete, header_of, incomplete
+from ..completeness import Incomplete, header_of, incomplete, lost_in_gaps
 
 SAME_MOMENT = 0.08
 """Difference from an instant, as a share of the time between two frames, that is attributed to the error of the
@@ -41,6 +41,14 @@ class TimeLine:
         return (self.moments - first) / max(last - first, 1e-9)
 
 
+class _Stored(NamedTuple):
+    """A stored picture."""
+
+    stamp: int | None
+    key: bool
+    corrupt: bool
+
+
 class Recorded(NamedTuple):
     """What a video's stored pictures say without being decoded."""
 
@@ -58,7 +66,7 @@ def frame_seconds(path: Path) -> np.ndarray:
 
 
 def recorded(path: Path) -> Recorded:
-    """Read the moments of a video's frames; no picture is decoded.
+    """Read the moments of a video's frames; at most the first picture is decoded.
 
     Raises:
         UserError: the file is no video.
@@ -72,27 +80,59 @@ def recorded(path: Path) -> Recorded:
                 raise UserError(f"{path}: holds no pictures; take it out of the folder")
             stream: Any = container.streams.video[0]
             rate = float(stream.average_rate or 30)
-            header, hidden, stamps = header_of(container, stream), 0, []
+            header, hidden, packets = header_of(container, stream), 0, []
             for packet in container.demux(stream):
                 if packet.size and packet.is_discard:
                     hidden += 1
-                elif packet.size and not packet.is_corrupt:  # as the last one of a copy that was cut off
-                    stamps.append(packet.pts)
+                elif packet.size:
+                    packets.append(_Stored(packet.pts, packet.is_keyframe, packet.is_corrupt))
             unit = float(stream.time_base)
     except (FFmpegError, OSError, ValueError) as error:
         reason = getattr(error, "strerror", None) or type(error).__name__
         raise UserError(f"{path}: is not a video that decodes ({reason}); save it as .mp4, or take it out") from None
+    if packets and packets[-1].corrupt:  # as the last one of a copy that was cut off
+        packets.pop()
+    stamps = [packet.stamp for packet in packets]
+    if stamps and not packets[0].key:  # nothing is shown before the first key frame
+        begin = _first_stamp(path)
+        stamps = [stamp for stamp in stamps if begin is None or stamp is None or stamp >= begin]
     known = sorted(stamp for stamp in stamps if stamp is not None)
     if not stamps or not 0.0 < rate < MAX_RATE:
         raise UserError(f"{path}: holds no frame that can be timed; save it as .mp4, or take it out")
-    if len(known) != len(stamps):
+    if 2 * len(known) < len(stamps):
         return Recorded(np.arange(len(stamps)) / rate, False, None)
+    known = _filled(stamps, round(1.0 / (rate * unit)))
     seconds = (np.array(known, np.float64) - known[0]) * unit
     if not np.isfinite(seconds).all() or seconds[-1] > MAX_SECONDS:
         raise UserError(f"{path}: its frames are {seconds[-1]:g} seconds apart; save it as .mp4, or take it out")
     length, latest = float(seconds[-1]), float(known[-1] * unit)
-    there = incomplete(header, rate, decoded=len(stamps), hidden=hidden, seconds=length, latest=latest)
+    lost = lost_in_gaps(seconds)
+    there = incomplete(header, rate, decoded=len(stamps), hidden=hidden, seconds=length, latest=latest, lost=lost)
     return Recorded(seconds, True, there)
+
+
+def _first_stamp(path: Path) -> int | None:
+    """Return the time stamp of the first frame that a video shows; None if it has none."""
+    import av
+    from av.error import FFmpegError
+
+    with av.open(str(path)) as container:
+        for packet in container.demux(video=0):
+            try:
+                for frame in packet.decode():
+                    return frame.pts
+            except FFmpegError:  # later packets may be intact
+                continue
+    return None
+
+
+def _filled(stamps: Sequence[int | None], step: int) -> list[int]:
+    """Return the time stamps in ascending order; those that are unknown follow the one before by a step."""
+    filled: list[int] = []
+    for stamp in stamps:
+        known = next(each for each in stamps if each is not None) if not filled else filled[-1] + step
+        filled.append(known if stamp is None else stamp)
+    return sorted(filled)
 
 
 def time_line(

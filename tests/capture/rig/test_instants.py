@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from helpers.films import cut_film, pan
+from helpers.films import cut_film, encoded, pan, without_beginning
 from scgs_warp.capture.rig.instants import frame_seconds, time_line
 from scgs_warp.capture.source import Video
 from scgs_warp.data.synthetic.films.encoding import write_film
@@ -39,6 +39,17 @@ def test_frames_before_a_cut_do_not_count(tmp_path):
     cut_film(tmp_path / "whole.mp4", tmp_path / "cut.mp4", 10)
     shown = list(Video(tmp_path / "cut.mp4").frames(64))
     assert len(shown) == 50 and len(frame_seconds(tmp_path / "cut.mp4")) == len(shown)
+
+
+@pytest.mark.parametrize("kind", ["mp4", "mkv", "ts"])
+def test_frames_before_the_first_key_frame_do_not_count(tmp_path, kind):
+    """No decoder shows them, and sound is on the clock of the first frame that is shown."""
+    encoded(tmp_path / f"whole.{kind}", 60, gop=20)
+    without_beginning(tmp_path / f"whole.{kind}", tmp_path / f"cut.{kind}", 7)
+    shown = list(Video(tmp_path / f"cut.{kind}").frames(64))
+    found = frame_seconds(tmp_path / f"cut.{kind}")
+    np.testing.assert_allclose(found, [still.seconds for still in shown], atol=1e-6)
+    assert len(shown) == 40
 
 
 def test_locked_cameras_share_their_moments():
