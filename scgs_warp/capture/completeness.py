@@ -72,7 +72,7 @@ def _stated(text: str) -> float:
     return int(parts[1]) * 3600.0 + int(parts[2]) * 60.0 + float(parts[3]) if parts else 0.0
 
 
-def lost_in_gaps(seconds: Sequence[float]) -> int:
+def lost_in_gaps(seconds: Sequence[float] | np.ndarray) -> int:
     """Return the number of frames that are missing where a film of an even rate has none for long, by the times of the
     others: damage of .mkv and .ts leaves such gaps. A film that rests for most of its time has lost none."""
     steps = np.diff(np.asarray(seconds, np.float64))
