@@ -384,4 +384,4 @@ class EditSession(Posing):
 
     def export_ply(self, path: str | Path, time: float, at: float | None = None) -> None:
         """Write the edited Gaussians at one moment as a 3D-GS file, world units."""
-        write_gaussian_ply(path, self.gaussians_at(time, at))
+        write_gaussian_ply(path, self.gaussians_at(time, at), antialiased=self.scene.config.antialiased)

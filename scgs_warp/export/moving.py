@@ -32,11 +32,12 @@ def export_tracks(
         points: a number, the name of a .csv of points, or None (:func:`~scgs_warp.export.tracks.build_tracks`).
 
     Raises:
-        UserError: the points cannot be read, there is no surface, or the file cannot be written.
+        UserError: the points cannot be read, there is no surface, memory does not suffice, or the file cannot be
+            written.
     """
     chosen = None if points is None else int(points) if points.isdecimal() else read_points(Path(points))
     with progress(len(moments), "export") as shown:
-        tracks = build_tracks(scene, session, moments, chosen, shown.advance)
+        tracks = build_tracks(scene, session, moments, chosen, shown.advance, path.suffix.lower())
     write_tracks(path, tracks, scene.overview.up)
     return f"tracks of {tracks.points.shape[1]:,} points at {len(moments)} instants"
 

@@ -18,6 +18,7 @@ from ..edit import EditSession
 from ..edit.rotations import from_matrix, rotate
 from ..edit.skeleton import Skeleton as Parts
 from ..errors import UserError
+from ..runtime import memory
 from ..types import Gaussians
 from .skeleton import (
     AnimationMoment,
@@ -34,6 +35,10 @@ WIDTH = 4
 PRIOR = 1e-4
 """Weight of the previous moment's rotation, relative to the spread of a part's Gaussians: it decides what they do not,
 such as the twist of a line."""
+
+
+TRACK_BYTES = 64
+"""Memory of a Gaussian at a moment while a rig is built."""
 
 
 class RigLoss(NamedTuple):
@@ -76,9 +81,11 @@ def build_rig(
         advance: called after each moment.
 
     Raises:
-        UserError: no Gaussian is finite at all moments.
+        UserError: no Gaussian is finite at all moments, or memory does not suffice.
     """
     scene, frames = session.scene, []
+    need, what = TRACK_BYTES * len(rows) * len(moments), f"--skeleton parts of {len(moments):,} instants"
+    memory.require(need, "cpu", what, "give fewer --frames, or a shorter film")
     with torch.no_grad():
         start = scene.gaussians_at(0.0)
         rows = rows & finite_rows(start)

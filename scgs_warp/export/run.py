@@ -177,6 +177,8 @@ def _export_moving(request: ExportRequest, device: str) -> str:
     scene, session = _open(request, device), None
     if request.edit is None and not scene.motion.moves:
         _refuse_at_rest(request)
+    if request.edit is None and scene.motion.moves and request.kind not in FRAME_FORMATS:
+        _refuse_without_joints(request, scene)
     if request.edit is not None or (request.kind not in FRAME_FORMATS and scene.motion.moves):
         session = _open_session(request, scene)
     parts = session.skeleton if session is not None and request.skeleton == "parts" else None
@@ -211,6 +213,16 @@ def _refuse_at_rest(request: ExportRequest) -> None:
         for option in ("frames", "fps"):
             if getattr(request, option) is not None:
                 raise UserError(f"--{option}: {request.run} stands still; leave it out")
+
+
+def _refuse_without_joints(request: ExportRequest, scene: Scene) -> None:
+    """Refuse formats whose motion is that of control points, for motion models that have none."""
+    if not hasattr(scene.motion, "apply_pose"):
+        still = "a still (--time), " if request.kind == "glb" else ""
+        raise UserError(
+            f"--format {request.kind}: holds the motion of control points, and that of {request.run} has none "
+            f"({scene.motion_name}); write {still}a --format ply-sequence, 4dgs or tracks"
+        )
 
 
 def _write_frames(

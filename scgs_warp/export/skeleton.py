@@ -18,8 +18,12 @@ from ..edit import EditSession
 from ..edit.pose import compose, own_pose
 from ..errors import UserError
 from ..gaussians import GaussianParameters
+from ..runtime import memory
 from ..scene.scene import Scene
 from ..types import Gaussians, Pose
+
+JOINT_BYTES = 1600
+"""Memory of a control point at a moment while a skeleton is built and written."""
 
 
 class AnimationMoment(NamedTuple):
@@ -141,10 +145,13 @@ def build_skeleton(
         advance: called after each moment.
 
     Raises:
-        UserError: the motion is not finite, or the scene has a mask and an edit: masked Gaussians do not follow edited
-            control points by skinning alone.
+        UserError: the motion is not finite, memory does not suffice, or the scene has a mask and an edit: masked
+            Gaussians do not follow edited control points by skinning alone.
     """
     engine, scene = session.engine, session.scene
+    count, length = len(engine.rig.positions), len(moments)
+    what = f"the motion of {count:,} control points at {length:,} instants"
+    memory.require(JOINT_BYTES * count * length, "cpu", what, "give fewer --frames, or a shorter film")
     masked = bool(scene.config.motion.mask) and engine.rig.moves
     poses, own = [], []
     for moment in moments:

@@ -17,6 +17,7 @@ from ..edit.rotations import conjugate, multiply, rotate, unit
 from ..errors import UserError
 from ..gaussians import SH_C0
 from ..ops.sampling import farthest_points
+from ..runtime import memory
 from ..runtime.search_tree import search_tree
 from ..scene.scene import Scene
 from ..storage.files import read_bytes, write_atomically
@@ -31,6 +32,10 @@ MIN_OPACITY = 0.5
 MAX_POINTS = 1_000_000
 MAX_BYTES = 2**27
 """Largest file of points, in bytes."""
+POINT_BYTES = {".npz": 56, ".csv": 160, ".glb": 64}
+"""Memory of a point at a moment while tracks are built and written, by suffix."""
+WEIGHT_BYTES = 12
+"""Memory of a weight of a morph target at a moment in a .glb, which has a target for each moment."""
 
 
 class Tracks(NamedTuple):
@@ -57,7 +62,7 @@ def read_points(path: Path) -> np.ndarray:
     content = read_bytes(path, "give a .csv with a point per line: x,y,z")
     if len(content) > MAX_BYTES:
         raise UserError(f"{path}: has more than {MAX_BYTES >> 20} MiB; give fewer points")
-    lines = csv.reader(io.StringIO(content.decode("utf-8", "replace")))
+    lines = csv.reader(io.StringIO(content.decode("utf-8-sig", "replace")))
     points: list[list[float]] = []
     try:
         for number, fields in enumerate(lines, 1):
@@ -91,6 +96,7 @@ def build_tracks(
     moments: list[AnimationMoment],
     chosen: int | np.ndarray | None = None,
     advance: Callable[[], None] | None = None,
+    suffix: str = ".npz",
 ) -> Tracks:
     """Follow points of the surface.
 
@@ -99,9 +105,10 @@ def build_tracks(
         chosen: a number of Gaussians, spread evenly over the surface at time 0; or points [P, 3] at time 0, each of
             which keeps its place beside the nearest Gaussian of the surface; or None, all Gaussians of the surface.
         advance: called after each moment.
+        suffix: that of the file to be written, which decides on the memory.
 
     Raises:
-        UserError: no Gaussian is opaque, or the motion is not finite.
+        UserError: no Gaussian is opaque, the motion is not finite, or memory does not suffice.
     """
     start = scene.gaussians_at(0.0)
     surface = np.flatnonzero(finite_rows(start) & (start.opacities.cpu().numpy() >= MIN_OPACITY))
@@ -116,6 +123,10 @@ def build_tracks(
         offsets = chosen - means[surface]
     elif chosen is not None and chosen < len(surface):
         surface = surface[np.sort(farthest_points(start.means[surface].cpu(), chosen).numpy())]
+    count, length = len(surface), len(moments)
+    need = POINT_BYTES[suffix] * count * length + (WEIGHT_BYTES * length**2 if suffix == ".glb" else 0)
+    fewer = "give fewer --frames or --points"
+    memory.require(need, "cpu", f"--format tracks of {count:,} points at {length:,} instants", fewer)
     frames, colors = [], None
     for moment in moments:
         posed = posed_gaussians(scene, session, moment)

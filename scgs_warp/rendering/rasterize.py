@@ -188,6 +188,8 @@ def _refuse(**unsupported: bool) -> None:
 
 def _check_dtypes(**tensors: Tensor | None) -> None:
     for name, tensor in tensors.items():
+        if tensor is not None and not isinstance(tensor, Tensor):
+            raise ValueError(f"{name} must be a torch tensor, got {type(tensor).__name__}; use torch.as_tensor")
         if tensor is not None and tensor.dtype != torch.float32:
             raise ValueError(f"{name} must be float32, got {tensor.dtype}")
 

@@ -12,6 +12,8 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
+from ..errors import UserError
+
 _threads: int | None = None
 _configured = False
 _torch_spins = False
@@ -77,6 +79,24 @@ def warp_finds_gpu() -> bool:
 
     init_warp()
     return wp.is_cuda_available()
+
+
+def check_device(device: str) -> None:
+    """Check the name of a device, and that it is there.
+
+    Raises:
+        UserError: names the argument and the remedy.
+    """
+    import torch
+
+    try:
+        kind = torch.device(device).type
+    except (RuntimeError, TypeError):
+        kind = ""
+    if kind not in ("cpu", "cuda"):
+        raise UserError(f"device is {device!r}; choose cpu or cuda")
+    if kind == "cuda" and not torch.cuda.is_available():
+        raise UserError(f"device is {str(device)!r}, but torch finds no CUDA GPU here; choose cpu")
 
 
 def available_threads() -> int:

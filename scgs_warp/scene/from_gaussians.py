@@ -16,6 +16,7 @@ from ..geometry.axes import Axis, direction
 from ..geometry.cameras import Overview
 from ..geometry.normalisation import COMMON_RADIUS, Normalisation
 from ..motion.static_nodes import COUNT, StaticNodes
+from ..runtime.environment import check_device
 from .scene import Scene
 
 FOV_AND_ELEVATION = (40.0, 10.0)
@@ -35,8 +36,9 @@ def open_gaussians(
         up: up direction of the overview, or its axis; None: -y, the convention of structure from motion.
 
     Raises:
-        UserError: as :func:`~scgs_warp.formats.gaussian_files.read_gaussians`.
+        UserError: as :func:`~scgs_warp.formats.gaussian_files.read_gaussians`, or there is no such device.
     """
+    check_device(device)
     gaussians = read_gaussians(path)
     with shortage_as_user_error(Path(path)):
         towards = direction(up) if isinstance(up, str) else up

@@ -24,6 +24,7 @@ from ..motion.base import Motion
 from ..motion.control_points import ControlPoints
 from ..motion.spheres import Spheres
 from ..rendering.render import render
+from ..runtime.environment import check_device
 from ..storage import checkpoint
 from ..storage.files import read_text
 from ..storage.json_files import parse_json
@@ -81,8 +82,10 @@ class Scene:
             The scene of the newest checkpoint, ready to render.
 
         Raises:
-            UserError: the checkpoint is missing or damaged, or training has not reached its second stage.
+            UserError: the checkpoint is missing or damaged, training has not reached its second stage, or there is no
+                such device.
         """
+        check_device(device)
         folder = Path(run)
         if not folder.is_dir():
             raise UserError(f"{folder}: no such run directory; apps/train.py --output makes one")

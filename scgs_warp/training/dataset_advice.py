@@ -20,6 +20,7 @@ from ..types import Frame
 from .scene_distance import place
 from .silhouettes import is_in_parts, is_thin
 from .standing_cameras import LATE, standing_groups
+from .vanishing import VIEWS, has_content
 
 MOST_PAIRS = 12
 FEWEST_PAIRS = 6
@@ -95,6 +96,8 @@ class Survey:
     """True if the distance of the scene from the cameras is a guess."""
     ends: tuple[float, float] = (0.0, 1.0)
     """First and last time of a frame."""
+    blank: bool = False
+    """True if the images show nothing but the background."""
 
 
 def survey(data: Dataset) -> Survey:
@@ -137,6 +140,7 @@ def survey(data: Dataset) -> Survey:
         standing=len(groups),
         guessed=placed.guessed,
         ends=(float(instants[0]), float(instants[-1])),
+        blank=not any(has_content(data, index) for index in spread(len(data), VIEWS)),
     )
 
 
@@ -244,6 +248,8 @@ def _expectation(facts: Survey, compares_depth: bool) -> str:
             "nothing: the cameras look away from the content; poses in transforms.json are OpenGL's (y up, z backward),"
             " not OpenCV's (y down, z forward)"
         )
+    if facts.blank:
+        return "nothing: the images show nothing but the background"
     if facts.instants < 2:
         return "a scene at rest: all frames are of one instant"
     if facts.guessed and not compares_depth:

@@ -86,6 +86,7 @@ def fit(
     """
     # 1. Refuse what cannot run.
     check(config)
+    environment.check_device(device)
     check_share(config, group)
     environment.ensure_configured()
     if data.background != config.data.background:

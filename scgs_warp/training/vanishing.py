@@ -72,13 +72,13 @@ def shows_nothing(scene: Scene, data: Dataset) -> bool:
             entry = data.entries[index]
             if bool(scene.render(entry.camera, entry.time).alpha.any()):
                 return False
-            sought = sought or _has_content(data, index)
+            sought = sought or has_content(data, index)
     finally:
         scene.motion.train(training)
     return sought
 
 
-def _has_content(data: Dataset, index: int) -> bool:
+def has_content(data: Dataset, index: int) -> bool:
     """Return whether an image differs from the background; False if it is no longer readable."""
     try:
         frame = data[index]

@@ -263,7 +263,7 @@ def curves(log_path: str | Path, out_png: str | Path) -> None:
             if points:
                 axes.plot(list(points), list(points.values()), style, label=label, markersize=3, linewidth=1.2)
         drawn = len(axes.lines)
-        if title == "loss" and drawn:
+        if title == "loss" and any(np.max(line.get_ydata()) > 0 for line in axes.lines):
             axes.set_yscale("log")
         for _, start in starts[1:]:
             axes.axvline(start, color="0.6", linestyle=":", linewidth=1)

@@ -7,8 +7,13 @@ from pathlib import Path
 import pytest
 import torch
 
+from helpers.edit_scenes import bar_scene
 from helpers.export_runs import export, moving_run, save, still_scene
 from scgs_warp.apps import export as app
+from scgs_warp.config.presets import from_dict
+from scgs_warp.motion import build_motion
+from scgs_warp.runtime import memory
+from scgs_warp.scene.scene import Scene
 
 
 @pytest.fixture(scope="module")
@@ -68,6 +73,32 @@ def test_mistakes_are_one_line_and_leave_nothing(run, tmp_path, capsys):
         lines = capsys.readouterr().err.strip().splitlines()
         assert len(lines) == 1 and words in lines[0], lines
     assert sorted(path.name for path in tmp_path.iterdir()) == before
+
+
+@pytest.mark.parametrize("output", ["a.npz", "a.glb"])
+@pytest.mark.parametrize("more", [[], ["--skeleton", "parts"]])
+def test_motion_that_does_not_fit_into_memory_is_refused(output, more, run, tmp_path, monkeypatch, capsys):
+    if more and output == "a.npz":
+        pytest.skip("has no such skeleton")
+    monkeypatch.setattr(memory, "fits", lambda need, device="cpu": need < 2**20)
+    arguments = ["--run", str(run), "--output", str(tmp_path / output), "--frames", "1000", *more, "--device", "cpu"]
+    assert app.cli(arguments) == 2
+    said = capsys.readouterr().err
+    assert "1,000 instants needs" in said and "give fewer --frames, or a shorter film" in said
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("model", ["hexplane", "per-gaussian"])
+@pytest.mark.parametrize(("name", "kind"), [("a.npz", "npz"), ("a.glb", "glb"), ("a.glb", "graph")])
+def test_motion_without_control_points_names_what_can_be_written(model, name, kind, tmp_path, capsys):
+    like, config = bar_scene(nodes=8, gaussians=20), from_dict({"motion": {"model": model, "layers": 3, "skip": 2}})
+    scene = Scene(like.gaussians, build_motion(model, config), like.normalisation, config, like.overview)
+    folder = save(scene, tmp_path / "run")
+    arguments = ["--run", str(folder), "--output", str(tmp_path / name), "--format", kind, "--device", "cpu"]
+    assert app.cli(arguments) == 2
+    said = capsys.readouterr().err
+    assert f"--format {kind}: holds the motion of control points, and that of {folder} has none ({model})" in said
+    assert ("a still (--time), " in said) is (kind == "glb") and "--format ply-sequence, 4dgs or tracks" in said
 
 
 def test_what_is_said_counts_what_is_written(run, tmp_path, capsys):

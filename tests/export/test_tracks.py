@@ -14,7 +14,8 @@ from helpers.node_packages import gltf_errors
 from scgs_warp.edit.rotations import conjugate, multiply, rotate, unit
 from scgs_warp.errors import UserError
 from scgs_warp.export.skeleton import even_moments
-from scgs_warp.export.tracks import build_tracks, read_points, write_tracks
+from scgs_warp.export.tracks import POINT_BYTES, build_tracks, read_points, write_tracks
+from scgs_warp.runtime import memory
 from scgs_warp.scene.scene import Scene
 
 UP = (0.0, 0.0, 1.0)
@@ -121,6 +122,21 @@ def test_points_of_a_file(tmp_path):
             read_points(path)
     with pytest.raises(UserError, match=r"no\.csv"):
         read_points(tmp_path / "no.csv")
+
+
+def test_points_of_a_spreadsheet_begin_with_a_byte_order_mark(tmp_path):
+    path = tmp_path / "points.csv"
+    for text in ("x,y,z\n1,2,3\n", "1,2,3\n"):
+        path.write_text(text, encoding="utf-8-sig")
+        assert read_points(path).tolist() == [[1.0, 2.0, 3.0]]
+
+
+@pytest.mark.parametrize("suffix", [".npz", ".csv", ".glb"])
+def test_tracks_that_do_not_fit_into_memory_are_refused(suffix, scene, monkeypatch):
+    monkeypatch.setattr(memory, "fits", lambda need, device: need <= POINT_BYTES[suffix] * 149 * 5 + 500)
+    build_tracks(scene, None, MOMENTS, suffix=suffix)
+    with pytest.raises(memory.NotEnoughMemory, match=r"tracks of 149 points at 6 instants needs .*give fewer --frames"):
+        build_tracks(scene, None, even_moments(6, 4.0), suffix=suffix)
 
 
 def test_a_scene_without_surface_is_refused():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +19,7 @@ from scgs_warp.edit import EditSession
 from scgs_warp.edit.rotations import from_axis
 from scgs_warp.errors import UserError
 from scgs_warp.export.run import write_still
-from scgs_warp.formats.gaussian_files import read_gaussians
+from scgs_warp.formats.gaussian_files import read_antialiased, read_gaussians
 from scgs_warp.formats.gaussian_ply import OPAQUE_LOGIT, read_gaussian_ply, write_gaussian_ply
 from scgs_warp.geometry import cameras
 from scgs_warp.scene.from_gaussians import open_gaussians
@@ -98,6 +99,14 @@ def test_a_file_is_edited_and_exported(tmp_path):
     assert float((found.means - before.means).norm(dim=1).max()) > 1.0
     image = session.render(cameras.orbit_camera(scene.overview, 0.0, 64), 0.0)
     assert float(image.alpha.max()) > 0.5
+
+
+def test_an_edited_file_keeps_the_mark_of_antialiasing(tmp_path):
+    scene = open_gaussians(make(tmp_path), nodes=40)
+    for antialiased in (True, False):
+        scene.config = dataclasses.replace(scene.config, antialiased=antialiased)
+        EditSession(scene).export_ply(tmp_path / "edited.ply", 0.0)
+        assert read_antialiased(tmp_path / "edited.ply") is antialiased
 
 
 def test_the_public_example_opens_bends_and_exports(tmp_path, data_root):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 
+import numpy as np
 import pytest
 import torch
 
@@ -191,6 +192,12 @@ def test_what_is_wrong_or_not_done_is_named(argument):
     arguments = dict(zip(names, (*shape, colors, viewmats, Ks, WIDTH, HEIGHT))) | argument
     with pytest.raises((ValueError, NotImplementedError), match=next(iter(argument))):
         scgs_warp.rasterization(**arguments)
+
+
+def test_arrays_of_numpy_are_named():
+    arrays = [np.zeros((2, columns), np.float32) for columns in (3, 4, 3)]
+    with pytest.raises(ValueError, match=r"means must be a torch tensor, got ndarray; use torch\.as_tensor"):
+        scgs_warp.rasterization(*arrays, np.zeros(2), np.zeros((2, 3)), np.eye(4)[None], np.eye(3)[None], 8, 8)
 
 
 def test_render_is_rasterization_with_expected_depth(device):

@@ -11,10 +11,28 @@ import sys
 import pytest
 import torch
 
+from helpers.tiny import tiny_config, tiny_dataset
 from scgs_warp.apps import cli
+from scgs_warp.errors import UserError
 from scgs_warp.gaussians import GaussianParameters
 from scgs_warp.motion.network import encode
 from scgs_warp.runtime import environment
+from scgs_warp.scene.from_gaussians import open_gaussians
+from scgs_warp.scene.scene import Scene
+from scgs_warp.training.loop import fit
+
+
+def test_devices_that_are_not_there_are_named(tmp_path, monkeypatch):
+    """In Python, too, where torch would only assert."""
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+    for load in (Scene.load, open_gaussians):
+        with pytest.raises(UserError, match="device is 'cuda', but torch finds no CUDA GPU here; choose cpu"):
+            load(tmp_path, "cuda")
+        with pytest.raises(UserError, match="device is 'gpu'; choose cpu or cuda"):
+            load(tmp_path, "gpu")
+    with pytest.raises(UserError, match="finds no CUDA GPU"):
+        fit(tiny_config(20), tiny_dataset(2), output=tmp_path / "run", device="cuda")
+    assert not (tmp_path / "run").exists()
 
 
 @pytest.mark.parametrize(

@@ -103,6 +103,13 @@ def test_a_rig(own_moments):
     assert "optim.cameras" in advise(film, config)[1]
 
 
+def test_images_that_show_nothing():
+    data = handheld(8, 2.0)
+    black = [dataclasses.replace(frame, image=torch.zeros_like(frame.image)) for frame in data]
+    assert "expect nothing: the images show nothing" in lines(Dataset(black, folder=Path("x"), split="train"))[1]
+    assert not survey(data).blank
+
+
 def test_a_batch_sees_frames_more_often():
     facts = dataclasses.replace(survey(handheld(41, 2.0)), points=5000)
     config = with_steps(preset("cpu"), 200)

@@ -125,6 +125,14 @@ def test_curves_of_next_to_nothing(tmp_path: Path, lines: list) -> None:
     assert (tmp_path / "curves.png").stat().st_size > 0
 
 
+@pytest.mark.filterwarnings("error")
+def test_curves_of_losses_that_are_zero(tmp_path: Path) -> None:
+    """As with images that are all black."""
+    write_log(tmp_path / "log.jsonl", [{"step": step, "stage": "main", "loss": 0.0, "l1": 0.0} for step in (50, 100)])
+    figures.curves(tmp_path / "log.jsonl", tmp_path / "curves.png")
+    assert (tmp_path / "curves.png").stat().st_size > 0
+
+
 def test_missing_log_is_told(tmp_path: Path) -> None:
     with pytest.raises(UserError, match=r"log\.jsonl"):
         figures.curves(tmp_path / "log.jsonl", tmp_path / "curves.png")
