@@ -218,10 +218,10 @@ def _refuse_at_rest(request: ExportRequest) -> None:
 def _refuse_without_joints(request: ExportRequest, scene: Scene) -> None:
     """Refuse formats whose motion is that of control points, for motion models that have none."""
     if not hasattr(scene.motion, "apply_pose"):
-        still = "a still (--time), " if request.kind == "glb" else ""
+        still = "a still (--time), or " if request.kind == "glb" else ""
         raise UserError(
             f"--format {request.kind}: holds the motion of control points, and that of {request.run} has none "
-            f"({scene.motion_name}); write {still}a --format ply-sequence, 4dgs or tracks"
+            f"({scene.motion_name}); write {still}--format ply-sequence, 4dgs or tracks"
         )
 
 

@@ -214,7 +214,9 @@ def _pose(session: EditSession, moment: AnimationMoment, masked: bool) -> tuple[
     if bent is None:
         return motion.pose, None
     if masked:
-        raise UserError("--edit: this scene's motion has a mask (motion.mask); write the edit as a ply-sequence")
+        raise UserError(
+            "--edit: this scene's motion has a mask (motion.mask); write a film, ply-sequence, 4dgs or tracks"
+        )
     return compose(motion, bent), own_pose(motion, bent)
 
 

@@ -198,6 +198,8 @@ class _LogLines(Progress):
 
     def _finish(self, completed: bool) -> None:
         elapsed = self.elapsed
+        if not completed and self.done == self._start:
+            return  # refused before the first step
         rate = (self.done - self._start) / elapsed if elapsed > 0 else 0.0
         self._line(f"{rate:.1f} it/s  {'done' if completed else 'stopped'} after {clock(elapsed)}")
 

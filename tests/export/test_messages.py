@@ -98,7 +98,7 @@ def test_motion_without_control_points_names_what_can_be_written(model, name, ki
     assert app.cli(arguments) == 2
     said = capsys.readouterr().err
     assert f"--format {kind}: holds the motion of control points, and that of {folder} has none ({model})" in said
-    assert ("a still (--time), " in said) is (kind == "glb") and "--format ply-sequence, 4dgs or tracks" in said
+    assert ("a still (--time), or " in said) is (kind == "glb") and "--format ply-sequence, 4dgs or tracks" in said
 
 
 def test_what_is_said_counts_what_is_written(run, tmp_path, capsys):
