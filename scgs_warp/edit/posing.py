@@ -159,10 +159,10 @@ class Posing:
         return strongest(self.skeleton.owners()[indices], weights)
 
     def pose_part(self, part: str, time: float = 0.0) -> Handle:
-        """Return the handle that poses a part; add one if there is none.
+        """Return the handle that poses a part at a time; add one if there is none, or none that shows then.
 
         Args:
-            time: scene time to which the target of a new handle refers.
+            time: scene time, to which the target of a new handle refers.
 
         Raises:
             UserError: there is no such part.
@@ -367,7 +367,7 @@ class Posing:
         poser, now = self.engine.poser(skeleton), self.engine.base_at(edit, time).positions
         targets, moves = self.engine.targets(edit, at), []
         for handle in edit.handles:
-            share = handle.strength(time) if handle.part is not None else 0.0
+            share = handle.strength(time, edit.reach) if handle.part is not None else 0.0
             if share > 0.0:
                 then = now if handle.time == time else self.engine.base_at(edit, handle.time).positions
                 moves.append(PartMove(handle, targets[handle.name], share, then))
@@ -378,13 +378,16 @@ class Posing:
 
 
 def _with_handle(edit: Edit, skeleton: Skeleton, part: str, time: float) -> tuple[Edit, Handle]:
-    """Return the edit with a handle for a part, and that handle; the same edit if it has one."""
+    """Return the edit with a handle that poses a part at a time, and that handle; the same edit if it has one."""
     nodes = skeleton.part(part).nodes
     FieldReader({"time": float(time)}, f"part {part!r}").number("time", None, 0.0, 1.0)
-    for handle in edit.handles:
-        if handle.part == part:
-            return edit, handle
+    own = [row for row, handle in enumerate(edit.handles) if handle.part == part]
+    acting = [edit.handles[row] for row in own if edit.handles[row].strength(time, edit.reach) > 0.0]
+    if acting:
+        return edit, acting[-1]  # which counts
     taken = {handle.name for handle in edit.handles}
     names = [part, *(f"{part} ({i})" for i in range(2, len(taken) + 3))]
     handle = Handle(next(name for name in names if name not in taken), nodes, float(time), part=part)
-    return dataclasses.replace(edit, handles=(*edit.handles, handle), skeleton=skeleton), handle
+    row = own[0] if own else len(edit.handles)  # those of other moments count more
+    handles = (*edit.handles[:row], handle, *edit.handles[row:])
+    return dataclasses.replace(edit, handles=handles, skeleton=skeleton), handle

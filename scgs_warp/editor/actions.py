@@ -105,11 +105,15 @@ def grab(editor: Host, fields: FieldReader) -> None:
     from . import gizmo_pose
 
     model, moment = editor.model, editor.model.moment()
+    handle = editor.session.edit.handle(model.active or "")
+    if handle is not None and handle.part is not None and not model.acts(handle):
+        editor.parts.choose(handle.part)
+    model.prefer_acting()
+    handle = editor.session.edit.handle(model.active or "")
     if editor.parts.part is not None:
         editor.parts.grab()
         editor.held = None
         return
-    handle = editor.session.edit.handle(model.active or "")
     if handle is None:
         _need_selection(editor)
         frame, target = gizmo_pose.frame_of_selection(editor.session, model.selection, moment)

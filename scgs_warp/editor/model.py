@@ -12,7 +12,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from ..edit import Edit, EditSession, Target, edit_file
+from ..edit import Edit, EditSession, Handle, Target, edit_file
 from ..edit.handles import STAY
 from ..errors import UserError
 from .keys import keyed
@@ -187,9 +187,25 @@ class EditorModel:
         self.changed()
 
     def _holder(self) -> str | None:
-        """Return the handle that holds exactly the selection, so that no second one is made there."""
-        handles = self.session.edit.handles
-        return next((handle.name for handle in handles if handle.nodes == self.selection), None)
+        """Return the handle that holds exactly the selection, so that no second one is made there; of several, the one
+        that counts at the moment shown."""
+        held = [handle for handle in self.session.edit.handles if handle.nodes == self.selection]
+        acting = [handle.name for handle in held if self.acts(handle)]
+        return acting[-1] if acting else held[-1].name if held else None
+
+    def acts(self, handle: Handle) -> bool:
+        """Return whether a handle acts at the moment shown."""
+        return handle.strength(self.time, self.session.edit.reach) > 0.0
+
+    def prefer_acting(self) -> None:
+        """If the active handle does not act at the moment shown, so that dragging it would show nothing, choose another
+        one on its control points that does, or only these."""
+        with self.lock:
+            held = self.session.edit.handle(self.active or "")
+            if held is not None and not self.acts(held):
+                self.selection = held.nodes
+                other = self.session.edit.handle(self._holder() or "")
+                self.active = other.name if other is not None and self.acts(other) else None
 
     def activate(self, name: str | None) -> None:
         """Choose an existing handle and select its nodes."""
@@ -213,6 +229,7 @@ class EditorModel:
             if self.active is None and not self.selection:
                 raise UserError("nothing is chosen; click on the picture first")
             self.begin_drag()
+            self.prefer_acting()
             try:
                 if self.active is None:
                     draft = self.session.fork()
@@ -245,6 +262,10 @@ class EditorModel:
         automatic = self._pins_are_automatic()
         fields = {"lasts": self.lasts, "window": self.window, "stiffness": self.stiffness}
         handle = draft.add_handle(self.selection, self.time, **fields)
+        *others, _ = draft.edit.handles
+        row = next((row for row, other in enumerate(others) if other.nodes == handle.nodes), len(others))
+        others.insert(row, handle)  # those of other moments count more
+        draft.edit = dataclasses.replace(draft.edit, handles=tuple(others))
         if self.pin_rings is not None and (automatic or not draft.edit.pins):
             draft.pin_rest(self.pin_rings)
             self._automatic.append(draft.edit.pins)

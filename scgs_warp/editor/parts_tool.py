@@ -6,6 +6,7 @@ A click takes the part under it, a second click on the same part its control poi
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -165,8 +166,14 @@ class PartsTool:
         self.release()
 
     def _moved(self) -> None:
-        self.model.dragged()
-        self.model.active = next((h.name for h in self.model.session.edit.handles if h.part == self.part), None)
+        """Let handles that the drag has made act as the page says, and choose the one that poses the part."""
+        model, edit = self.model, self.model.session.edit
+        known = {handle.name for handle in self._since.handles} if self._since is not None else set()
+        fields = {"lasts": model.lasts, "window": model.window, "stiffness": model.stiffness}
+        made = (h if h.name in known else dataclasses.replace(h, **fields) for h in edit.handles)
+        model.session.preview(dataclasses.replace(edit, handles=tuple(made)))
+        model.dragged()
+        model.active = next((h.name for h in reversed(edit.handles) if h.part == self.part and model.acts(h)), None)
 
     def release(self) -> None:
         """End the drag, which is one step for undo."""

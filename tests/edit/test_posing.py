@@ -129,6 +129,24 @@ def test_a_pull_takes_the_grip_and_leaves_the_trunk(session):
     assert not session.edit.handles, "a pull is one step"
 
 
+def test_a_part_that_one_frame_poses_is_posed_at_other_moments_too(session):
+    session.turn("head", 40, (0, 0, 1), 0.5)
+    (first,) = session.edit.handles
+    session.apply(dataclasses.replace(session.edit, handles=(dataclasses.replace(first, lasts="frame"),)))
+    frame = session.node_positions(0.5)
+    before = session.node_positions(0.2)
+    tip = furthest(session, "head")
+    session.turn("head", -30, (0, 0, 1), 0.2)
+    turned = rigid_fit(before[tip], session.node_positions(0.2)[tip])[0]
+    np.testing.assert_allclose(turned, from_axis((0, 0, 1), -30), atol=0.02)
+    np.testing.assert_array_equal(session.node_positions(0.5), frame, "the frame keeps its pose")
+    assert [handle.time for handle in session.edit.handles] == [0.2, 0.5]
+    session.turn("head", -30, (0, 0, 1), 0.2)
+    session.turn("head", 10, (0, 0, 1), 0.5)
+    assert len(session.edit.handles) == 2, "each is turned further where it shows"
+    assert not np.array_equal(session.node_positions(0.5), frame)
+
+
 def test_a_dragged_pull_is_measured_from_its_beginning(session):
     session.turn("shoulder_left", 20, (0, 1, 0))
     begin = session.edit

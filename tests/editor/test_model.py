@@ -288,3 +288,23 @@ def test_a_moment_of_a_long_film_is_known_at_once(model, monkeypatch):
 
 def test_a_moment_shows_the_film_or_the_handles(model):
     assert model.moment() == Moment(0.0, None, False)
+
+
+def test_what_one_frame_poses_is_moved_at_other_moments_too(model):
+    """A drag of a handle that does not show at the moment would show nothing: another one is made on its points, and
+    the frame keeps its pose."""
+    session = model.session
+    model.set(lasts="frame", pin_rings=None)
+    model.select((3, 4, 5))
+    for at, height in ((1.0, 0.2), (3.0, 0.4), (1.0, 0.3)):
+        model.look(at)
+        before = session.node_positions(model.time)
+        model.grab(Target())
+        model.drag(Target((0.0, 0.0, height)))
+        model.release()
+        moved = session.node_positions(model.time)[[3, 4, 5]] - before[[3, 4, 5]]
+        assert np.abs(moved).max() > 0.05
+    first, second = (session.edit.handle(name) for name in ("handle 1", "handle 2"))
+    assert first is not None and second is not None and len(session.edit.handles) == 2
+    assert second.nodes == first.nodes and first.time != second.time and model.active == "handle 1"
+    assert session.edit.targets["handle 1"].translation[2] == 0.3

@@ -212,3 +212,23 @@ def test_a_changed_skeleton_unchooses_the_part(tool):
         session.merge_parts(session.skeleton.part(part).parent, part)
     assert tool.part is None
     assert tool.model.undo() and tool.part == part
+
+
+def test_a_part_is_posed_in_one_frame_and_in_another(tool):
+    """What is set before a part is pulled holds for the handles that the pull makes."""
+    model, session = tool.model, tool.model.session
+    model.set(lasts="frame")
+    click(tool)
+    for at in (1.0, 3.0):
+        model.look(at)
+        before = session.node_positions(model.time)
+        tool.grab()
+        grip = before[list(model.selection)].mean(0)
+        tool.pull(grip + AWAY, grip)
+        model.release()
+        assert np.linalg.norm(session.node_positions(model.time) - before, axis=1).max() > 0.1
+        own = session.edit.handle(model.active or "")
+        assert own is not None and own.lasts == "frame" and own.time == model.time and own.part == tool.part
+    assert {handle.lasts for handle in session.edit.handles} == {"frame"}
+    unedited = session.engine.to_world(session.engine.motion_at(0.9).positions)
+    np.testing.assert_array_equal(session.node_positions(0.9), unedited)
