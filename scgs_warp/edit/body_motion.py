@@ -80,15 +80,15 @@ def motion_of_session(session: EditSession, seconds: float) -> BodyMotion:
         seconds: duration of the whole film, above 0.
 
     Raises:
-        UserError: nothing moves.
+        UserError: the scene has no motion.
     """
+    if not session.scene.motion.moves:
+        name = session.scene.folder or "the scene"
+        raise UserError(f"{name}: stands still; take the motion of a scene that moves, or of a glTF character")
     skeleton, times = session.skeleton, _instants(seconds)
     # A film that is played again has jumped back at its end.
     moments = session.edit.film.seconds * np.minimum(times / seconds, 1.0 - 1e-9)
     tracks = np.stack([session.node_positions(session.scene_time(at), at) for at in moments.tolist()])
-    if not np.ptp(tracks, axis=0).any():
-        name = session.scene.folder or "the scene"
-        raise UserError(f"{name}: stands still; take the motion of a scene that moves, or of a glTF character")
     rows = {name: row for row, name in enumerate(skeleton.names)}
     turns = np.tile(IDENTITY, (len(times), len(rows), 1))
     shifts, centres = np.zeros((len(times), len(rows), 3)), np.zeros((len(rows), 3))
