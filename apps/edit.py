@@ -188,15 +188,11 @@ def play_motion(session: EditSession, options: Options, device: str) -> None:
     """Play the motion of a run or of a glTF character on the session's scene, frozen where its edit freezes it."""
     from scgs_warp.edit import EditSession, motion_of_gltf, motion_of_session, retarget
     from scgs_warp.edit.retarget import read_match
-    from scgs_warp.errors import UserError
     from scgs_warp.scene.scene import Scene
 
     assert options.motion is not None
     if options.motion.is_dir():
-        scene = Scene.load(options.motion, device=device)
-        if not scene.motion.moves:
-            raise UserError(f"--motion {options.motion}: stands still; give a run that moves, a .glb or a .gltf")
-        source = EditSession(scene)
+        source = EditSession(Scene.load(options.motion, device=device))
         motion = motion_of_session(source, source.edit.film.seconds)
     else:
         motion = motion_of_gltf(options.motion, options.clip)
