@@ -18,6 +18,7 @@ from ..lens import Lens, make_lens
 from ..name_times import times_from_names
 from ..natural_order import natural
 from .colmap_model import ModelCamera, ModelImage, find_model, read_model
+from .transforms import in_any_case
 
 MADE_FROM = "give the images that the model was made from, with their names"
 """What to do about missing images."""
@@ -73,7 +74,8 @@ def _image_folder(folder: Path, model_folder: Path) -> Path:
 
 
 def _file(base: Path, image: ModelImage, model_folder: Path) -> Path:
-    return inside(base, image.name, f"{model_folder}: the name of an image", "image")
+    file = inside(base, image.name, f"{model_folder}: the name of an image", "image")
+    return in_any_case(file) or file
 
 
 def _cameras(images: list[ModelImage]) -> list[str]:

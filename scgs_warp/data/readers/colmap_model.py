@@ -8,6 +8,7 @@ Format: https://colmap.github.io/format.html
 from __future__ import annotations
 
 import functools
+import re
 import struct
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -179,7 +180,7 @@ def _plausible_count(count: int, left: int, least: int) -> int:
 
 
 def _lines(data: bytes) -> Iterator[str]:
-    return (line for line in data.decode("utf-8").removesuffix("\n").split("\n") if not line.startswith("#"))
+    return (line for line in data.decode("utf-8-sig").removesuffix("\n").split("\n") if not line.startswith("#"))
 
 
 def _text_cameras(data: bytes) -> dict[int, ModelCamera]:
@@ -195,16 +196,29 @@ def _text_cameras(data: bytes) -> dict[int, ModelCamera]:
 
 
 def _text_images(data: bytes) -> list[ModelImage]:
-    images, lines = [], _lines(data)
-    for line in lines:
-        if not line.strip():
+    """Parse lines of images. Each is followed by its observations, a line that may be empty; editors and scripts that
+    drop empty lines leave no such lines."""
+    images, whole, observed = [], True, False
+    lines = list(_lines(data))
+    for number, line in enumerate(lines):
+        if observed or not line.strip():
+            observed = False
             continue
         words = line.split(maxsplit=9)
         values = np.array([float(word) for word in words[1:8]])
         images.append(ModelImage(words[9].strip(), int(words[8]), _pose(values[:4], values[4:], words[9])))
-        if next(lines, None) is None:  # The line of observations is present even if it is empty.
+        follows = lines[number + 1] if number + 1 < len(lines) else None
+        observed = follows is not None and not _names_image(follows)
+        if follows is None and whole:
             raise _Damaged(f"truncated after {words[9][:60]!r}: its line of observations is missing")
+        whole = whole and observed
     return images
+
+
+def _names_image(line: str) -> bool:
+    """Return whether a line ends with a name. Observations end with the number of a point."""
+    words = line.split()
+    return len(words) >= 10 and re.fullmatch(r"-?[0-9]+", words[-1]) is None
 
 
 def _text_points(data: bytes) -> tuple[np.ndarray, np.ndarray]:

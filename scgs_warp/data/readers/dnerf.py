@@ -81,7 +81,9 @@ def _check_times(folder: Path, path: Path, entries: list[dict[str, Any]]) -> Non
     training = transforms_path(folder, "train")
     if not training.is_file():
         return
-    timed, trained = (any("time" in entry for entry in each) for each in (entries, read_transforms(training)["frames"]))
+    timed, trained = (
+        any(entry.get("time") is not None for entry in each) for each in (entries, read_transforms(training)["frames"])
+    )
     if timed != trained:
         lacks, has = (training, path) if timed else (path, training)
         raise UserError(

@@ -197,8 +197,8 @@ def _lens(path: Path, content: dict[str, Any], ratio: int, source: tuple[int, in
         raise UserError(f"{path}: focal_length or pixel_aspect_ratio is missing or not a positive number; give pixels")
     if centre is None or skew is None:
         raise UserError(f"{path}: principal_point or skew is missing or not a number; give pixels")
-    radial = as_array(content.get("radial_distortion", [0.0] * 3), (2,), (3,), (4,))
-    tangential = as_array(content.get("tangential_distortion", content.get("tangential", [0.0] * 2)), (2,))
+    radial = as_array(content.get("radial_distortion") or [0.0] * 3, (2,), (3,), (4,))
+    tangential = as_array(content.get("tangential_distortion") or content.get("tangential") or [0.0] * 2, (2,))
     if radial is None or tangential is None or (len(radial) == 4 and radial[3] != 0):
         raise UserError(
             f"{path}: radial_distortion must be three numbers, tangential_distortion two; correct them, or undistort "

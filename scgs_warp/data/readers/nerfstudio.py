@@ -10,7 +10,7 @@
 from __future__ import annotations
 
 from functools import partial
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 import numpy as np
@@ -91,9 +91,9 @@ def _record(
 def _depth(path: Path, folder: Path, content: dict[str, Any], index: int) -> DepthFile | None:
     """Return the depth map that a frame names."""
     name = content["frames"][index].get("depth_file_path")
-    if name is None:
+    if name is None or name == "":
         return None
-    if not (isinstance(name, str) and name):
+    if not isinstance(name, str):
         raise UserError(f"{path}: frames[{index}].depth_file_path is not text; name the depth map or leave it out")
     unit = as_number(content.get("depth_unit_scale_factor", MILLIMETRE))
     if unit is None or unit <= 0.0:
@@ -111,7 +111,7 @@ def _of_depth(path: Path, content: dict[str, Any]) -> list[str]:
 
 
 def _times(path: Path, entries: list[dict[str, Any]], files: list[Path]) -> list[float]:
-    if any("time" in entry for entry in entries):
+    if any(entry.get("time") is not None for entry in entries):
         return read_times(path, entries)
     moments = _moments(files)
     last = max(len(set(moments)) - 1, 1)
@@ -151,7 +151,7 @@ def _of_split(path: Path, content: dict[str, Any], files: list[Path], indices: l
     listed = lists[name]
     if not isinstance(listed, list) or not listed or not all(isinstance(item, str) for item in listed):
         raise UserError(f"{path}: {name}_filenames is empty or not a list of file names; name at least one file")
-    known = {entry["file_path"]: index for index, entry in enumerate(content["frames"])}
+    known = _Names([entry["file_path"] for entry in content["frames"]])
     for item in listed:
         if item not in known:
             raise UserError(
@@ -160,12 +160,37 @@ def _of_split(path: Path, content: dict[str, Any], files: list[Path], indices: l
     named = {known[item] for item in listed}
     if name == "train":  # what is held out is not trained on, though some exporters list all frames here
         others = [lists[other] for other in ("val", "test") if isinstance(lists.get(other), list)]
-        held = {known.get(item) for other in others for item in other if isinstance(item, str)}
+        held = {known[item] for other in others for item in other if isinstance(item, str) and item in known}
         named = named - held or named  # lists that all name every frame mean it
     chosen = sorted(named & set(indices))
     if not chosen:
         raise UserError(f"{path}: no frame of {name}_filenames is left; choose more frames, or restore their images")
     return chosen
+
+
+class _Names:
+    """Numbers of frames by their names, which lists may write in other ways: ``./a.png`` for ``a.png``, another slash,
+    or the file's name alone."""
+
+    def __init__(self, names: list[str]) -> None:
+        self._numbers: dict[str, int] = {}
+        short: dict[str, list[int]] = {}
+        for index, name in enumerate(names):
+            self._numbers[name] = self._numbers[_plain(name)] = index
+            short.setdefault(_plain(name).rsplit("/", 1)[-1], []).append(index)
+        for name, indices in short.items():
+            if len(indices) == 1:
+                self._numbers.setdefault(name, indices[0])
+
+    def __contains__(self, name: str) -> bool:
+        return name in self._numbers or _plain(name) in self._numbers
+
+    def __getitem__(self, name: str) -> int:
+        return self._numbers[name if name in self._numbers else _plain(name)]
+
+
+def _plain(name: str) -> str:
+    return PurePosixPath(name.replace("\\", "/")).as_posix()
 
 
 def _points(

@@ -58,19 +58,19 @@ def read(folder: Path, split: str, options: ReadOptions) -> Dataset:
     if len(cameras) != len(rows):
         raise UserError(
             f"{path}: has {len(rows)} rows, but {folder} holds {len(cameras)} folders of images "
-            f"({cameras[0].name} to {cameras[-1].name}); give each camera a row and a folder"
+            f"({_label(folder, cameras[0])} to {_label(folder, cameras[-1])}); give each camera a row and a folder"
         )
     wanted = of_cameras([_label(folder, camera) for camera in cameras], options)
     if len(wanted) < 2:
         raise UserError(f"--only-cameras {options.only_cameras}: name two cameras or more; the first is held out")
     held_out = wanted[HELD_OUT_CAMERA]
     chosen = [index for index in wanted if (index == held_out) != (split == "train")]
-    files = [_files(camera) for camera in cameras]
+    files = _with_gaps([_files(camera) for camera in cameras])
     records = []
     for index in chosen:
         if len(files[index]) != len(files[held_out]):
             raise UserError(
-                f"{cameras[index]}: holds {len(files[index])} images, but {cameras[held_out].name} "
+                f"{cameras[index]}: holds {len(files[index])} images, but {_label(folder, cameras[held_out])} "
                 f"{len(files[held_out])}; all cameras need the same instants"
             )
         viewmat = row_viewmat(path, index, rows[index, :15].reshape(3, 5))
@@ -136,6 +136,18 @@ def _cameras(folder: Path) -> list[Path]:
 def _files(folder: Path) -> list[Path]:
     files = [p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES]
     return sorted(files, key=lambda p: natural(p.name))
+
+
+def _with_gaps(files: list[list[Path]]) -> list[list[Path]]:
+    """Return the cameras' images of all instants. If few cameras have fewer images than most, under the same names,
+    their lists also name the images that are missing."""
+    longest = max(files, key=len)
+    names = [file.stem for file in longest]
+    complete = sum(len(own) == len(longest) for own in files)
+    if 2 * complete <= len(files) or not {file.stem for own in files for file in own} <= set(names):
+        return files
+    there = [{file.stem: file for file in own} for own in files]
+    return [[own.get(p.stem, each[0].with_name(p.name)) for p in longest] for own, each in zip(there, files)]
 
 
 def row_viewmat(path: Path, index: int, pose: np.ndarray) -> np.ndarray:

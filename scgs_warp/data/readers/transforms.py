@@ -70,14 +70,14 @@ def read_pose(path: Path, index: int, entry: dict[str, Any]) -> np.ndarray:
 
 def read_times(path: Path, entries: list[dict[str, Any]]) -> list[float]:
     """Return every frame's time in [0, 1]; if no frame has a time, times are evenly spaced in the order of the file."""
-    given = ["time" in entry for entry in entries]
+    given = [entry.get("time") is not None for entry in entries]
     if not any(given):
         last = max(len(entries) - 1, 1)
         return [index / last for index in range(len(entries))]
     times = []
     for index, entry in enumerate(entries):
         where = f"{path}: frames[{index}].time"
-        if "time" not in entry:
+        if not given[index]:
             raise UserError(f"{where} is missing, but other frames have one; give a time to every frame or to no frame")
         time = as_number(entry["time"])
         if time is None:
@@ -131,9 +131,9 @@ def find_mask(path: Path, folder: Path, index: int, entry: dict[str, Any]) -> Pa
         UserError: the name is no text, or leads out of the folder.
     """
     mask = entry.get("mask_path")
-    if mask is None:
+    if mask is None or mask == "":
         return None
-    if not (isinstance(mask, str) and mask):
+    if not isinstance(mask, str):
         raise UserError(f"{path}: frames[{index}].mask_path is not text; name the mask's file or leave it out")
     return inside(folder, mask, f"{path}: frames[{index}].mask_path", "mask")
 

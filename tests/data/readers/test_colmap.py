@@ -194,6 +194,35 @@ def test_faults_are_named(tmp_path, fault):
     assert expected in message(tmp_path)
 
 
+def bare(content: bytes) -> bytes:
+    """Without lines of observations, as editors and scripts that drop empty lines leave it."""
+    rows = [row for row in content.split(b"\n") if not row.startswith(b"#")]
+    return b"\n".join(rows[::2])
+
+
+EDITS = {
+    "no observations": ("images.txt", bare),
+    "windows": ("images.txt", lambda content: b"\xef\xbb\xbf" + content.replace(b"\n", b"\r\n")),
+    "byte order mark": ("cameras.txt", lambda content: b"\xef\xbb\xbf" + content),
+}
+
+
+@pytest.mark.parametrize("edit", EDITS)
+def test_text_as_editors_and_scripts_leave_it(tmp_path, edit):
+    write_colmap(tmp_path, text=True)
+    name, change = EDITS[edit]
+    file = tmp_path / "sparse/0" / name
+    file.write_bytes(change(file.read_bytes()))
+    train = load(tmp_path)
+    assert len(train) == 12 and share_found(train, 0.02) > FOUND
+
+
+def test_names_may_differ_in_case(tmp_path):
+    write_colmap(tmp_path)
+    (tmp_path / "images/frame_3.png").rename(tmp_path / "images/Frame_3.PNG")
+    assert len(load(tmp_path)) == 12
+
+
 def test_one_frame_cannot_be_split(tmp_path):
     write_colmap(tmp_path, count=1)
     assert "one frame cannot be both" in message(tmp_path)

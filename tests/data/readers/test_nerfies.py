@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+
 import numpy as np
 import pytest
 import torch
@@ -83,6 +85,14 @@ def test_masks_of_nerf_ds_hide_nothing(tmp_path):
     for index in range(1, 13):
         save_image(tmp_path / f"mask/1x/{index:06d}.png.png", np.zeros((HEIGHT, WIDTH), np.uint8))
     assert load(tmp_path)[0].mask is None
+
+
+def test_cameras_without_distortion(tmp_path):
+    write_nerfies(tmp_path)
+    for file in (tmp_path / "camera").iterdir():
+        camera = json.loads(file.read_text())
+        file.write_text(json.dumps({**camera, "radial_distortion": None, "tangential_distortion": None}))
+    assert share_found(load(tmp_path)) > 0.75
 
 
 CAMERA = "camera/000003.json"

@@ -157,6 +157,39 @@ def test_a_black_border_is_masked_but_nothing_dark_inside(tmp_path):
     assert not small[0, 4:11].any() and small[1:].all()
 
 
+def test_lists_may_write_names_in_other_ways(tmp_path):
+    content = write(tmp_path)
+    for form in ("./{}", ".\\{}", "{}"):
+        lists = {"train_filenames": [form.format("f_3.png")], "test_filenames": [form.format("f_0.png")]}
+        save(tmp_path, {**content, **lists})
+        assert [frame.name for frame in load(tmp_path, "train")] == ["f_3"]
+    (tmp_path / "inner").mkdir()
+    for frame in content["frames"]:
+        (tmp_path / frame["file_path"]).rename(tmp_path / "inner" / frame["file_path"])
+        frame["file_path"] = f"inner/{frame['file_path']}"
+    save(tmp_path, {**content, **lists})
+    assert [frame.name for frame in load(tmp_path, "test")] == ["f_0"], "the name alone"
+    twice = {**content["frames"][0], "file_path": "other/f_0.png"}
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other/f_0.png").write_bytes((tmp_path / "inner/f_0.png").read_bytes())
+    save(tmp_path, {**content, **lists, "frames": [*content["frames"], twice]})
+    assert "test_filenames names 'f_0.png'" in message(tmp_path, "test"), "of two frames"
+
+
+def test_fields_that_programs_leave_empty(tmp_path):
+    content = write(tmp_path)
+    expected = load(tmp_path).times
+    for frame in content["frames"]:
+        frame.update(time=None, mask_path="", depth_file_path="")
+    save(tmp_path, content)
+    assert (
+        load(tmp_path)[0].mask is None and not load(tmp_path).with_depth and len(load(tmp_path).times) == len(expected)
+    )
+    content["frames"][1]["time"] = 0.5
+    save(tmp_path, content)
+    assert "frames[0].time is missing" in message(tmp_path)
+
+
 def test_masks_of_frames(tmp_path):
     content = write(tmp_path)
     mask = np.full((HEIGHT, WIDTH), 255, np.uint8)

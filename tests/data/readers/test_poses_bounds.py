@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 import pytest
 
-from helpers.data_faults import NAN, gone, message, noise
+from helpers.data_faults import NAN, message, noise
 from helpers.layouts import (
     FOCAL,
     HEIGHT,
@@ -84,6 +84,23 @@ def entry(row: int, column: int, value: float):
     return bounds(edit)
 
 
+def other_name(folder: Path) -> None:
+    image = folder / "cam01/images/0002.png"
+    image.with_name("x.png").write_bytes(image.read_bytes())
+
+
+def test_images_that_are_missing(tmp_path):
+    """The others keep their times."""
+    write_poses_bounds(tmp_path)
+    (tmp_path / "cam01/images/0001.png").unlink()
+    train = load(tmp_path, "train")
+    assert len(train) == 8 and share_found(train) > FOUND
+    assert {frame.name: frame.time for frame in train}["cam01_0002"] == 1.0
+    assert any(
+        "1 of 9 frames are left out, because their images are missing (0001.png)" in note for note in train.notes
+    )
+
+
 FAULTS = {
     "damaged": (noise("poses_bounds.npy"), "poses_bounds.npy: no sound"),
     "shape": (bounds(lambda rows: rows[:, :15]), "has shape [4, 15]"),
@@ -92,7 +109,7 @@ FAULTS = {
     "scaled": (entry(2, 0, 5.0), "row 2 holds a matrix that is not a finite rotation"),
     "focal": (entry(1, 14, 0.0), "row 1 has a non-positive"),
     "aspect": (entry(1, 9, 300.0), "row 1 is of 300 x 60 pixels, but the images are 80 x 60"),
-    "one camera less": (gone("cam01/images/0002.png"), "cam01/images: holds 2 images, but images 3"),
+    "one camera less": (other_name, "cam01/images: holds 4 images, but cam00 3"),
     "undecodable": (noise("cam01/images/0001.png"), "0001.png: not an image"),
 }
 
