@@ -1,7 +1,7 @@
 """Distance of a scene from cameras that look the same way: a parallel rig, a camera on a tripod, a sideways drive.
 
 Optical axes that hardly converge meet at a place that errors of the poses decide. The distance is that of the data's
-points, that of its depth bounds, or that at which most of the parallax between images fits the poses.
+points, depth bounds or depth maps, or that at which most of the parallax between images fits the poses.
 """
 
 from __future__ import annotations
@@ -78,6 +78,9 @@ def _distance(data: Dataset) -> tuple[float | None, bool]:
         return (depth if depth > 0.0 else None), False
     if data.bounds is not None:
         return 2.0 / (1.0 / data.bounds[0] + 1.0 / data.bounds[1]), False
+    depth = _mapped_depth(data)
+    if depth is not None:
+        return depth, False
     size = float(np.linalg.norm(positions - positions.mean(axis=0), axis=1).max())
     if size <= rounding(positions):
         return None, True
@@ -87,6 +90,15 @@ def _distance(data: Dataset) -> tuple[float | None, bool]:
     if not np.isfinite(error):
         return None, True
     return float(np.clip(1.0 / (max(inverse, 0.0) + 2.0 * error), NO_PARALLAX * size, FARTHEST * size)), True
+
+
+def _mapped_depth(data: Dataset) -> float | None:
+    """Return the median depth of some depth maps; None if there are none, or all are empty."""
+    mapped = data.with_depth
+    maps = [data.depth(mapped[place]) for place in spread(len(mapped), MOST_FRAMES)]
+    known = [each[each > 0].numpy() for each in maps if each is not None]
+    values = np.concatenate([np.zeros(0, np.float32), *known])
+    return float(np.median(values)) if len(values) else None
 
 
 def depth_ahead(positions: np.ndarray, axes: np.ndarray, point: np.ndarray) -> float:

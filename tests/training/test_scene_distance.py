@@ -110,6 +110,15 @@ def test_points_and_bounds_tell_the_distance(tmp_path):
     assert load(tmp_path).bounds is None
 
 
+def test_depth_maps_tell_the_distance():
+    data = tripod(1e-3)
+    depth = torch.full((12, 16), 3.0)
+    depth[0] = 0.0  # unknown
+    mapped = [dataclasses.replace(frame, depth=depth) for frame in data]
+    placed = place(Dataset(mapped, folder=Path("mapped"), split="train"))
+    assert not placed.guessed and float(np.linalg.norm(placed.normalisation.centre)) == pytest.approx(3.0, rel=1e-2)
+
+
 def test_a_run_continues_wherever_it_placed_the_scene(tmp_path):
     """Versions place such scenes differently."""
     config, data = tiny_config(20), tripod(1e-3)
