@@ -32,14 +32,15 @@ CHOSEN_BY_THE_DATA = (
 
 
 def refuse_early(config: TrainConfig, output: Path, resume: bool) -> None:
-    """Refuse what can be refused without the data: impossible settings, an existing run, and other settings or fewer
-    steps than those of the run that is to continue.
+    """Refuse what can be refused without the data: impossible settings, an existing run, a folder that cannot be
+    written, and other settings or fewer steps than those of the run that is to continue.
 
     Raises:
         UserError: names the file or option, and the remedy. A damaged checkpoint is no error here.
     """
     check(config)
     refuse_existing(output, resume)
+    refuse_unwritable(output)
     if in_use(output):
         raise UserError(f"{output}: another trainer is running here; wait for it or choose another --output")
     if not resume:
@@ -59,6 +60,20 @@ def refuse_early(config: TrainConfig, output: Path, resume: bool) -> None:
         check_same_configuration(saved, to_dict(config), source, besides=CHOSEN_BY_THE_DATA)
     if isinstance(step, int):
         check_steps(step, config, source)
+
+
+def refuse_unwritable(output: Path) -> None:
+    """Refuse a run folder that cannot be made or written, as far as that is known without making it.
+
+    Raises:
+        UserError: names the folder and the remedy.
+    """
+    if os.path.lexists(output) and not output.is_dir():
+        raise UserError(f"{output}: is no folder; choose another --output")
+    folders = (output.absolute(), *output.absolute().parents)
+    nearest = next((folder for folder in folders if os.path.lexists(folder)), output)
+    if not os.path.isdir(nearest) or not os.access(nearest, os.W_OK | os.X_OK):
+        raise UserError(f"{output}: cannot be made or written in {nearest}; choose another --output")
 
 
 def refuse_empty_chunks(config: TrainConfig, times: Sequence[float]) -> None:

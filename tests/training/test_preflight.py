@@ -47,6 +47,22 @@ def test_what_can_be_refused_without_the_data(run, tmp_path):
             refuse_early(settings, folder, resume)
 
 
+def test_folders_that_cannot_be_written(tmp_path, monkeypatch):
+    config = tiny_config(40)
+    (tmp_path / "file").write_text("")
+    (tmp_path / "link").symlink_to(tmp_path / "nowhere")
+    for folder, expected in (
+        (tmp_path / "file", "file: is no folder; choose another --output"),
+        (tmp_path / "link", "link: is no folder"),
+        (tmp_path / "file/a/b", "b: cannot be made or written in .*file; choose another --output"),
+    ):
+        with pytest.raises(UserError, match=expected):
+            refuse_early(config, folder, False)
+    monkeypatch.setattr("os.access", lambda path, mode: path != tmp_path)
+    with pytest.raises(UserError, match="cannot be made or written in"):
+        refuse_early(config, tmp_path / "new/run", False)
+
+
 def test_neighbours_that_the_data_chose_are_left_to_it(run):
     """The run's few steps rule a second try out, so that its checkpoint has ``track``."""
     config = tiny_config(40)
