@@ -22,6 +22,8 @@ NO_WARP_GPU = (
     "the driver or install the wheel for CUDA 12 of the same version (+cu12) from github.com/NVIDIA/warp/releases"
 )
 """Warp lists no device of a driver that is older than its CUDA version."""
+MOST_THREADS = 1024
+"""Largest number of threads: the libraries crash where the system refuses them more."""
 
 
 def choose_device(device: Device) -> str:
@@ -103,6 +105,8 @@ def prepare(device: Device, threads: int | None, memory_gib: float | None = None
     """
     if threads is not None and threads < 1:
         raise UserError(f"--threads {threads}: must be at least 1")
+    if threads is not None and threads > MOST_THREADS:
+        raise UserError(f"--threads {threads}: give at most {MOST_THREADS:,}; more than the cores gain nothing")
     if memory_gib is not None and not 0.0 < memory_gib < math.inf:
         raise UserError(f"--memory-gib {memory_gib:g}: must be greater than 0")
     with environment.no_collection():

@@ -25,6 +25,7 @@ CASES = {
     "train --steps": "error: --steps: give a value after it; 'scgs-warp train --help' lists the options",
     "bench frame --motions x": "error: --motions: no such option; did you mean --motion?; 'scgs-warp bench --help'",
     "capture film.mp4": "error: --output is missing: ",
+    "train --threads 99999": "error: --threads 99999: give at most 1,024; more than the cores gain nothing",
     "train --port 9000": "error: --port: belongs to --live; give both, or neither",
     "view --run x --live --size 400": "error: --size: belongs to a film; leave it out with --live",
     "view --run x --live --path p.json": "error: --path: belongs to a film; leave it out with --live",
