@@ -106,9 +106,7 @@ def read_record3d(path: Path) -> ImportedScene:
     file, folder = place
     content = read_json(file, "export the capture again")
     poses = _table(file, content, "poses", 7)
-    images = [file for file in _files(folder, "*") if file.suffix.lower() in IMAGE_SUFFIXES]
-    if len(images) != len(poses):
-        raise UserError(f"{file}: has {len(poses)} poses, but {folder} holds {len(images)} images; export it again")
+    images = _paired(file, folder, len(poses))
     if "perFrameIntrinsicCoeffs" in content:
         lenses = _table(file, content, "perFrameIntrinsicCoeffs", 4)
         Ks = [_pinhole(*row) for row in lenses]
@@ -122,6 +120,8 @@ def read_record3d(path: Path) -> ImportedScene:
     stated = (_number(file, content, "w"), _number(file, content, "h"))
     frames, maps, readable = [], folder.parent / "depth", reads_exr()
     for index, (row, K, image) in enumerate(zip(poses, Ks, images)):
+        if image is None:
+            continue
         where = f"{file}: poses[{index}]"
         pose = np.eye(4)
         pose[:3, :3], pose[:3, 3] = quaternion_matrix(row[[3, 0, 1, 2]], where), row[4:]
@@ -129,8 +129,26 @@ def read_record3d(path: Path) -> ImportedScene:
         depth = maps / f"{image.stem}.exr"
         load = partial(read_exr, depth) if readable and depth.is_file() else None
         frames.append(ImportedFrame(image, from_arkit(rigid(pose, where)), lens, float(moments[index]), load))
-    left = not readable and any(maps.glob("*.exr"))
-    return ImportedScene("Record3D", frames, gravity=True, note=f"depth was not read: {INSTALL}" if left else None)
+    missing = len(poses) - len(frames)
+    notes = [f"{missing} of {len(poses)} poses have no image in {folder.name}, and are left out"] if missing else []
+    if not readable and any(maps.glob("*.exr")):
+        notes.append(f"depth was not read: {INSTALL}")
+    return ImportedScene("Record3D", frames, gravity=True, note="; ".join(notes) or None)
+
+
+def _paired(file: Path, folder: Path, count: int) -> list[Path | None]:
+    """Return the image of each of ``count`` poses, None for some that have none. Images are numbered as the poses.
+
+    Raises:
+        UserError: there are images without a pose, or fewer than half of the poses have one.
+    """
+    images = [image for image in _files(folder, "*") if image.suffix.lower() in IMAGE_SUFFIXES]
+    if len(images) == count:
+        return list(images)
+    numbered = {int(image.stem): image for image in images if image.stem.isdecimal()}
+    if len(numbered) < len(images) or not 2 * len(images) >= count or max(numbered, default=count) >= count:
+        raise UserError(f"{file}: has {count} poses, but {folder} holds {len(images)} images; export it again")
+    return [numbered.get(index) for index in range(count)]
 
 
 def is_scanner(path: Path) -> bool:

@@ -264,8 +264,9 @@ def test_malformed_folders(tmp_path):
     (record / "metadata.json").write_text(json.dumps(late))
     refused(record, tmp_path, "the time 1e")
     (record / "metadata.json").write_text(text)
-    (record / "rgb/3.png").unlink()
-    refused(record, tmp_path, "6 poses, but .* holds 5 images")
+    for number in range(1, 5):
+        (record / f"rgb/{number}.png").unlink()
+    refused(record, tmp_path, "6 poses, but .* holds 2 images")
     mixed = write_monst3r(tmp_path / "mixed")
     cv2.imwrite(str(mixed / "frame_0002.png"), np.zeros((36, 40, 3), np.uint8))
     refused(mixed, tmp_path, "frame_0002.png: is 40 x 36 pixels, but the first image is 48 x 36")
@@ -320,6 +321,21 @@ def test_unsure_depth_gives_no_points(tmp_path):
         level[:18] = 0
         cv2.imwrite(str(file), level)
     assert import_scene(scanner, tmp_path / "after", silent).points < 0.6 * before
+
+
+def test_images_of_record3d_that_are_missing(tmp_path):
+    """The others keep their poses and moments; images without a pose have none."""
+    record = write_record3d(tmp_path / "record3d")
+    whole = phone_apps.read_record3d(record).frames
+    (record / "rgb/3.png").unlink()
+    scene = phone_apps.read_record3d(record)
+    assert scene.note is not None and scene.note.startswith("1 of 6 poses have no image in rgb, and are left out")
+    for one, two in zip(scene.frames, [*whole[:3], *whole[4:]], strict=True):
+        assert one.image == two.image and one.moment == two.moment and (one.viewmat == two.viewmat).all()
+    (record / "rgb/7.png").write_bytes((record / "rgb/0.png").read_bytes())
+    (record / "rgb/8.png").write_bytes((record / "rgb/0.png").read_bytes())
+    with pytest.raises(UserError, match=r"6 poses, but .* holds 7 images"):
+        phone_apps.read_record3d(record)
 
 
 def test_the_folder_above_an_export_of_record3d(tmp_path):
