@@ -22,6 +22,8 @@ from .frame_times import REORDERED, rising
 SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
 DIGEST_BYTES = 1 << 20
 """Number of bytes of a file that are hashed at a time. Digests of earlier versions saw as many at both ends only."""
+LONGEST = 1000
+"""Largest time that names of images tell, as a multiple of that of images without gaps."""
 SAMPLE = 100
 """Number of stored pictures that show whether they have times of display."""
 
@@ -252,10 +254,10 @@ class Folder:
 
 def _moments(names: list[str]) -> list[float]:
     """Return the times of images in the order of their names, the usual time between two of them being 1: those in the
-    names if these rise, else the index."""
+    names if these rise without a gap that makes the others one moment, else the index."""
     moments = moments_in_names(names)
     steps = sorted(after - before for before, after in pairwise(moments or []))
-    if moments is None or steps[0] <= 0:
+    if moments is None or steps[0] <= 0 or sum(steps) > LONGEST * len(names) * steps[len(steps) // 2]:
         return [float(index) for index in range(len(names))]
     return [float((moment - moments[0]) / steps[len(steps) // 2]) for moment in moments]
 

@@ -121,6 +121,7 @@ def test_a_codec_that_nobody_knows(tmp_path):
         (["1403636579763555584.png", "1403636579813555584.png", "1403636579913555584.png"], [0.0, 0.5, 1.5]),
         (["a12.png", "b3.png", "c7.png"], [0.0, 1.0, 2.0]),  # not in the order of the names
         (["0001_a.png", "0001_b.png", "0002_a.png"], [0.0, 1.0, 2.0]),  # twice the same
+        (["1.png", "2.png", "3.png", "1403636579763555584.png"], [0.0, 1.0, 2.0, 3.0]),  # not of one counter
         (["x.png", "y.png"], [0.0, 1.0]),
     ],
 )
