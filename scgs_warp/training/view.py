@@ -27,9 +27,9 @@ from .silhouettes import SilhouetteSample, silhouette_term
 from .state import TrainState
 from .vanishing import recall
 
-VARIED_LATER = 4
+VARIED_LATER = 10
 """Interval of the steps on a random background once most are on that of the data: enough to keep what lies beside the
-subject transparent."""
+subject transparent. Every fourth step costs some scenes as much on the background of the data as it gains others."""
 
 
 class View(NamedTuple):

@@ -43,11 +43,11 @@ def test_each_stage_has_its_own_pooled_residual(stage_1, stage_2):
 
 
 @pytest.mark.parametrize("stage_1", [True, False])
-@pytest.mark.parametrize(("share", "varied"), [(0.0, []), (0.5, [*range(20), 20, 24, 36]), (1.0, [*range(40)])])
+@pytest.mark.parametrize(("share", "varied"), [(0.0, []), (0.5, [*range(20), 20, 30]), (1.0, [*range(40)])])
 def test_each_stage_has_its_own_choice_of_the_background(stage_1, share, varied):
-    """Later, every fourth step of the main stage, so that nothing comes back beside the subject."""
+    """Later, every tenth step of the main stage, so that nothing comes back beside the subject."""
     changes = {"pretrain": {"random_background": stage_1}, "loss": {"random_background": share}}
-    for step in (5, 9, 10, 29, 30, 31, 33, 34, 46, 49):
+    for step in (5, 9, 10, 29, 30, 31, 34, 39, 40, 46, 49):
         _, view = view_at(step, **changes)
         assert bool(view.background.any()) == (stage_1 if step < 10 else step - 10 in varied)
 
