@@ -271,8 +271,8 @@ class LossConfig:
     ssim: float = bounded(0.2, 0, 1)
     """Weight of D-SSIM; L1 has the rest."""
     random_background: float = newer(0.1, before=0.0, least=0, most=1)
-    """Share of the main stage until which the background changes in every step, and later in every tenth, if the data
-    has alpha (not in the paper): on one alone, Gaussians of its colour beside the subject change no image. 0: off."""
+    """Share of the main stage's steps, evenly spaced, that are on another background if the data has alpha (not in the
+    paper): on one alone, Gaussians of its colour beside the subject change no image. 0: off."""
     log_error: float = newer(0.002, before=0.0, least=0, most=1e3)
     """Weight of the logarithm of each view's mean squared error (not in the paper), which weighs views by their
     relative error, as PSNR does."""

@@ -27,10 +27,6 @@ from .silhouettes import SilhouetteSample, silhouette_term
 from .state import TrainState
 from .vanishing import recall
 
-VARIED_LATER = 10
-"""Interval of the steps on a random background once most are on that of the data: enough to keep what lies beside the
-subject transparent. Every fourth step costs some scenes as much on the background of the data as it gains others."""
-
 
 class View(NamedTuple):
     """What a step needs of one view. ``form`` and the shapes decide which operations the step consists of."""
@@ -202,13 +198,11 @@ def seeks_silhouettes(state: TrainState) -> bool:
 
 
 def varies_background(state: TrainState) -> bool:
-    """Return True in steps whose background is random: those of stage 1, of the main stage until
-    ``loss.random_background``, and every ``VARIED_LATER``-th from then on."""
-    config, step = state.config, state.stage_step
+    """Return True in steps whose background is random: those of stage 1, and an even share of the main stage's."""
     if state.stage == "pretrain":
-        return config.pretrain.random_background
-    until = round(config.loss.random_background * config.main_steps)
-    return step < until or (until > 0 and step % VARIED_LATER == 0)
+        return state.config.pretrain.random_background
+    step, share = state.stage_step, state.config.loss.random_background
+    return int((step + 1) * share) > int(step * share)
 
 
 def sh_degree(state: TrainState, step: int) -> int:
