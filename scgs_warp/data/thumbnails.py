@@ -20,12 +20,14 @@ ALIKE = 3
 
 def thumbnails(data: Dataset) -> str:
     """Return the thumbnails of up to ``IMAGES`` frames, evenly spaced, as hexadecimal bytes; nothing if one of them is
-    no longer readable."""
+    not finite or no longer readable."""
     content = bytearray()
     for index in spread(len(data), IMAGES):
         try:
             image = data[index].image
         except UserError:
+            return ""
+        if not image.isfinite().all():
             return ""
         small = torch.nn.functional.adaptive_avg_pool2d(image.permute(2, 0, 1), SIDE)
         content += bytes((small.clamp(0.0, 1.0) * 255.0).round().to(torch.uint8).flatten().tolist())

@@ -78,13 +78,7 @@ def motion_of_session(session: EditSession, seconds: float) -> BodyMotion:
 
     Args:
         seconds: duration of the whole film, above 0.
-
-    Raises:
-        UserError: the scene has no motion.
     """
-    if not session.scene.motion.moves:
-        name = session.scene.folder or "the scene"
-        raise UserError(f"{name}: stands still; take the motion of a scene that moves, or of a glTF character")
     skeleton, times = session.skeleton, _instants(seconds)
     # A film that is played again has jumped back at its end.
     moments = session.edit.film.seconds * np.minimum(times / seconds, 1.0 - 1e-9)

@@ -56,3 +56,9 @@ def test_an_image_that_is_gone_leaves_nothing_to_compare(tmp_path):
     data = load(tmp_path, cache_mib=0)
     (tmp_path / "f_0.png").unlink()
     assert thumbnails(data) == "" and not differ(SAME, "")
+
+
+def test_an_image_that_is_not_finite_has_no_thumbnail():
+    data = tiny_dataset(1)
+    frame = dataclasses.replace(data[0], image=torch.full((4, 4, 3), float("nan")), alpha=None)
+    assert thumbnails(Dataset([frame], folder=data.folder, split="train")) == ""

@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from helpers.edit_scenes import bar_scene
 from helpers.gltf_files import bar, box
 from scgs_warp.data.synthetic.figure_motion import bone_transforms
 from scgs_warp.edit import EditSession, motion_of_gltf, motion_of_session, retarget
@@ -19,8 +18,6 @@ from scgs_warp.edit.playback import Playback
 from scgs_warp.edit.retarget import match_names, read_match
 from scgs_warp.edit.rotations import IDENTITY, from_axis, least_turn, multiply, rotate, to_matrix
 from scgs_warp.errors import UserError
-from scgs_warp.motion import Static
-from scgs_warp.scene.scene import Scene
 
 ARM = ("shoulder_left", "elbow_left")
 
@@ -183,13 +180,6 @@ def test_mistakes_get_one_line_and_change_nothing(session):
     with pytest.raises(UserError, match="more than 0"):
         motion_of_session(session, 0.0)
     assert session.edit is before
-
-
-def test_a_scene_that_stands_still_has_no_motion():
-    like = bar_scene(nodes=24, gaussians=60)
-    still = Scene(like.gaussians, Static(), like.normalisation, like.config, like.overview)
-    with pytest.raises(UserError, match="the scene: stands still; take the motion of a scene that moves"):
-        motion_of_session(EditSession(still), 2.0)
 
 
 def test_names_that_nobody_gave_match_nothing(session):

@@ -100,3 +100,4 @@ def install(monkeypatch: pytest.MonkeyPatch, scene: FakeScene) -> None:
 
     monkeypatch.setattr(Scene, "load", staticmethod(load))  # on the class, which other modules have imported already
     monkeypatch.setattr("scgs_warp.scene.frame_colors.FrameColors.read", lambda folder: None)  # has no checkpoint
+    monkeypatch.setattr("scgs_warp.storage.checkpoint.read", lambda folder, names: ({}, {}))

@@ -34,16 +34,17 @@ def judge(mistake: Mistake, answer: Answer, before: dict[str, str], after: dict[
         faults.append("a traceback")
     if answer.status != mistake.status:
         faults.append(f"exit status {answer.status}, not {mistake.status}")
+    refused = mistake.status == REFUSED and not mistake.trains
     lines = answer.err.strip().splitlines()
-    if mistake.status == REFUSED and len(lines) != 1:
+    if refused and len(lines) != 1:
         faults.append(f"{len(lines)} lines on stderr, not one")
-    said = answer.err if mistake.status == REFUSED else answer.out + answer.err
+    said = answer.err if refused else answer.out + answer.err
     said = " ".join(said.split())
     faults += [f"does not say {part!r}" for part in mistake.says if part not in said]
     for path, content in before.items():
         if after.get(path) != content and not any(path.startswith(f"{name}/") for name in mistake.may_change):
             faults.append(f"{path} was {'changed' if path in after else 'lost'}")
-    if mistake.status == REFUSED:
+    if refused:
         left = sorted(set(after) - set(before))
         faults += [f"{left[0]} was left behind"] if left else []
     return faults

@@ -30,6 +30,8 @@ class Mistake(NamedTuple):
     given: str = "nothing"
     """Function of ``places.py`` that prepares the folder."""
     may_change: tuple[str, ...] = ()
+    trains: bool = False
+    """Whether it is refused only after training: then the run is kept, and all that is printed is the answer."""
 
 
 REFUSED, DONE = 2, 0
@@ -164,9 +166,10 @@ OWN_DATA = (
         "opencv-poses",
         "gives OpenCV poses",
         "train --data data/room --output runs/new {tiny}",
-        DONE,
-        ("look away", "OpenCV", "OpenGL"),
+        REFUSED,
+        ("look away", "OpenCV", "OpenGL", "nothing is left", "check cameras"),
         "opencv_poses",
+        trains=True,
     ),
     Mistake(
         "no-test-split",
