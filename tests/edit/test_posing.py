@@ -8,12 +8,13 @@ import numpy as np
 import pytest
 from scipy.sparse.csgraph import connected_components, shortest_path
 
+from helpers.edit_scenes import furthest
 from scgs_warp.data.synthetic.figure_motion import bone_transforms
 from scgs_warp.edit import EditSession
 from scgs_warp.edit.handles import STAY
 from scgs_warp.edit.part_pose import FREE_RINGS, INNER_STIFFNESS, PartMove, _rings_to_others
 from scgs_warp.edit.rotations import from_axis, logarithm, rigid_fit, rotate, to_matrix
-from scgs_warp.edit.skeleton import Part, Skeleton, strongest
+from scgs_warp.edit.skeleton import Part, Skeleton
 from scgs_warp.errors import UserError
 
 ARM = ("shoulder_left", "elbow_left")
@@ -33,13 +34,6 @@ def still_nodes(session: EditSession) -> list[int]:
     arm = np.isin(session.skeleton.owners(), [names.index(name) for name in ARM])
     away = shortest_path(session.engine.poser(session.skeleton).graph.matrix, unweighted=True)[:, arm].min(1)
     return np.flatnonzero(away > FREE_RINGS).tolist()
-
-
-def furthest(session: EditSession, part: str) -> list[int]:
-    """Return the part's control points with the most edges to every other part, which are held in any case."""
-    inside = session.skeleton.owners() == session.skeleton.names.index(part)
-    away = shortest_path(session.engine.poser(session.skeleton).graph.matrix, unweighted=True)[:, ~inside].min(1)
-    return np.flatnonzero(inside & (away == away[inside].max())).tolist()
 
 
 def test_a_turned_part_carries_those_that_hang_on_it(session):
@@ -276,52 +270,6 @@ def test_no_edge_of_the_poser_bridges_a_gap_and_none_is_missed(session):
 # The skeleton by hand
 
 
-def test_the_skeleton_is_changed_and_undone(session):
-    names = session.skeleton.names
-    session.turn("elbow_left", 30, (1, 0, 0))
-    session.rename_part("elbow_left", "left forearm")
-    assert session.edit.handles[0].part == "left forearm"
-    assert session.chain("left forearm") == ("left forearm", "shoulder_left")
-    nodes = session.skeleton.part("left forearm").nodes
-    low = [
-        n for n in nodes if session.node_positions(0.0)[n, 2] < np.median(session.node_positions(0.0)[list(nodes), 2])
-    ]
-    new = session.split_part("left forearm", low, "left hand")
-    assert session.skeleton.part(new).parent == "left forearm"
-    assert sorted((*session.skeleton.part(new).nodes, *session.skeleton.part("left forearm").nodes)) == list(nodes)
-    session.move_joint("left hand", (0.5, -0.1, -0.4), (0, 0, 2))
-    assert session.skeleton.part("left hand").axis == (0.0, 0.0, 1.0)
-    session.merge_parts("left forearm", "left hand")
-    assert session.skeleton.part("left forearm").nodes == nodes and session.skeleton.source == "edited"
-    session.merge_parts("shoulder_left", "left forearm")
-    assert not session.edit.handles, "the handle of a part that is gone goes with it"
-    for _ in range(6):
-        assert session.undo()
-    assert session.skeleton.names == names
-
-
-@pytest.mark.parametrize("order", [ARM, ARM[::-1]])
-def test_a_merged_part_turns_as_the_upper_one_did(session, order):
-    """Under either name: what hangs above the joint between the two stays where it is."""
-    upper = list(session.skeleton.part("shoulder_left").nodes)
-    session.turn("elbow_left", 60, (1, 0, 0))
-    bent, rest = session.edit, session.engine.to_world(session.engine.motion_at(0.0).positions)
-    session.merge_parts(*order)
-    assert session.skeleton.part(order[0]).parent == "torso" and not session.edit.handles
-    np.testing.assert_array_equal(session.node_positions(0.0), rest)
-    assert session.undo() and session.edit == bent
-    session.turn("shoulder_left", 70, (0, -1, 0))
-    before = session.node_positions(0.0)
-    session.merge_parts(*order)
-    assert [handle.part for handle in session.edit.handles] == [order[0]]
-    whole = furthest(session, order[0])
-    moved = rigid_fit(rest[whole], session.node_positions(0.0)[whole])[0]
-    np.testing.assert_allclose(moved, from_axis((0, -1, 0), 70), atol=1e-9)
-    off = np.linalg.norm(session.node_positions(0.0) - before, axis=1)
-    trunk = sorted(set(range(len(session))) - set(session.skeleton.part(order[0]).nodes))
-    assert off[upper].mean() < 0.04 and off[trunk].max() < 0.02, (off[upper].mean(), off[trunk].max())
-
-
 @pytest.mark.parametrize(
     "call, message",
     [
@@ -349,50 +297,6 @@ def test_mistakes_give_one_line_and_change_nothing(session, call, message):
         call(session)
     assert message in str(raised.value) and "\n" not in str(raised.value)
     assert session.edit == before
-
-
-def test_a_side_branch_of_equal_size_ends_a_chain():
-    """A finger moves without its hand, but a fragment on the upper arm does not stop the hand."""
-
-    def part(name, size, parent):
-        start = part.next
-        part.next += size
-        return Part(name, tuple(range(start, start + size)), parent, (0.0, 0.0, 0.0))
-
-    part.next = 0
-    tree = [("trunk", 50, None), ("arm", 9, "trunk"), ("fleck", 2, "arm"), ("forearm", 9, "arm")]
-    tree += [("hand", 6, "forearm"), ("index", 3, "hand"), ("thumb", 3, "hand"), ("leg", 20, "trunk")]
-    skeleton = Skeleton(tuple(part(*row) for row in tree))
-    assert skeleton.chain("thumb") == ("thumb",)
-    assert skeleton.chain("hand") == ("hand", "forearm", "arm")
-    assert skeleton.chain("leg") == ("leg",) and skeleton.chain("trunk") == ("trunk",)
-    assert skeleton.branch("arm") == ("arm", "fleck", "forearm", "hand", "index", "thumb")
-
-
-def test_a_number_of_parts_replaces_the_skeleton(figure):
-    session = figure.fork()
-    session.turn("head", 20, (0, 0, 1))
-    session.add_keyframe(0.0)
-    session.add_handle([3, 4], 0.0, "free")
-    session.add_keyframe(1.0)
-    session.use_parts(6)
-    assert len(session.skeleton.parts) == 6 and [h.name for h in session.edit.handles] == ["free"]
-    assert [(frame.at, list(frame.targets)) for frame in session.edit.keyframes] == [(1.0, ["free"])]
-    assert not session.edit.targets
-    assert session.undo() and session.edit.handle("head") is not None
-
-
-def test_a_gaussian_belongs_to_the_part_with_most_of_its_weight(session):
-    random = np.random.default_rng(0)
-    labels, weights = random.integers(0, 3, (50, 4)), random.random((50, 4))
-    wanted = [max(range(3), key=lambda part: weights[row, labels[row] == part].sum()) for row in range(50)]
-    assert strongest(labels, weights).tolist() == wanted
-    owner, found = session.skeleton.owners(), session.gaussian_parts()
-    assert found.shape == (session.scene.gaussian_count,)
-    assert (owner[session.engine.binding[0].numpy()] == found[:, None]).any(1).all()
-    points = session.gaussians_at(0.3).means.double().numpy()
-    for index in random.integers(0, len(points), 5).tolist():
-        assert session.part_at(points[index].tolist(), 0.3) == session.skeleton.names[found[index]]
 
 
 def test_a_part_is_found_where_an_edit_has_put_it(session):

@@ -8,11 +8,13 @@ from typing import Any
 
 import numpy as np
 import torch
+from scipy.sparse.csgraph import shortest_path
 
 from scgs_warp.config.presets import from_dict
 from scgs_warp.data.synthetic.builtin import sample_surface
 from scgs_warp.data.synthetic.figure import PARTS, build_figure
 from scgs_warp.data.synthetic.figure_motion import BONES, bone_transforms
+from scgs_warp.edit import EditSession
 from scgs_warp.edit.rotations import from_matrix
 from scgs_warp.edit.skeleton import Part, Skeleton
 from scgs_warp.gaussians import GaussianParameters, gaussians_from_points
@@ -216,3 +218,10 @@ def bone_skeleton(bones: list[str]) -> Skeleton:
             nodes = tuple(np.flatnonzero(np.array(bones) == name).tolist())
             parts.append(Part(name, nodes, parent, tuple(joints[name][:3, 3].tolist())))
     return Skeleton(tuple(parts))
+
+
+def furthest(session: EditSession, part: str) -> list[int]:
+    """Return the part's control points with the most edges to every other part, which are held in any case."""
+    inside = session.skeleton.owners() == session.skeleton.names.index(part)
+    away = shortest_path(session.engine.poser(session.skeleton).graph.matrix, unweighted=True)[:, ~inside].min(1)
+    return np.flatnonzero(inside & (away == away[inside].max())).tolist()
