@@ -42,7 +42,7 @@ def backgrounds(source: Source) -> str:
     both = ("before", "after")
     scores = {"": "psnr", "worst image, ": "psnr_worst", "on white, ": "psnr_white"}
     rows = []
-    for scene in (*ZOO, "rods-seed-1", "figure", "player"):
+    for scene in (*ZOO, "rods-seed-1", "standup-seed-1", "player"):
         if all(source.run(row, scene) for row in both):
             runs = [source.run(row, scene) for row in both]
             cells = [number(run[key], 2) if key in run else "" for key in scores.values() for run in runs]
