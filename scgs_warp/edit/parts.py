@@ -3,11 +3,11 @@
 Patches merge in three stages. First those whose union moves most rigidly (Ward's criterion), pairwise in rounds, down
 to a few dozen parts. Then patches change to a neighbouring part whose motion explains theirs better, so that early
 mistakes do not last. Last, neighbouring parts merge in the order of the angle by which they turn against each other,
-until every pair turns by more than the least angle of a joint. Parts of very few patches merge before all others, again
-by Ward's criterion: they show where they go, but hardly how they turn. Bands of skin at joints (``joint_bands``) go to
-the parts beside them, and parts that the motion does not tell apart merge (``shared_motion``). An angle, other than a
-distance, neither favours large parts nor splits a body whose surface drifts slowly, and so the number of parts follows
-from the motion.
+until every pair turns by more than the least angle of a joint. Parts of very few patches join before, if possible one
+of more, whose motion explains theirs best: they show where they go, but hardly how they turn. Bands of skin at joints
+(``joint_bands``) go to the parts beside them, and parts that the motion does not tell apart merge (``shared_motion``).
+An angle, other than a distance, neither favours large parts nor splits a body whose surface drifts slowly, and so the
+number of parts follows from the motion.
 
 Bodies bend where they are narrow. A boundary that is short for its parts (``_widths``) therefore counts as a joint at a
 smaller angle, and one that is long needs better evidence: where a surface looks the same in all places, its trained
@@ -83,8 +83,9 @@ def find_parts(patches: Patches, count: int | None = None) -> np.ndarray:
             break
         small = pairs[np.bincount(labels)[pairs].min(1) < least]
         if len(small):
-            costs = _costs(patches.moments.pooled(labels, parts), small)
-            labels = _joined(labels, small[costs.argmin()])
+            pooled, sizes = patches.moments.pooled(labels, parts), np.bincount(labels)[small]
+            costs = _costs(pooled, small) / pooled.count[small].min(1)
+            labels = _joined(labels, small[np.lexsort((costs, sizes.max(1) < least))[0]])
             continue
         turns, widths = relative_turns(*fits.robust(labels), pairs), _widths(patches.edges, labels, pairs)
         excess = turns / widths.clip(NARROW_TURN, 1.0)

@@ -39,9 +39,10 @@ def test_the_page_fetches_a_scene_once_even_if_it_is_told_of_it_twice():
         view.publish(pack({"gaussians": 10}, []), "step 1")
         page = live_cost.Follower(view.server.url)
         view.say("step 1")
-        for number in (2, 3):
-            view.publish(pack({"gaussians": 10}, []), f"step {number}")
-            view.say(f"step {number}, again")
+        for number in (1, 2, 3):
+            if number > 1:  # a page that is late fetches only the last of several scenes
+                view.publish(pack({"gaussians": 10}, []), f"step {number}")
+                view.say(f"step {number}, again")
             end = time.monotonic() + 60
             while page.scenes < number:
                 page.settle()

@@ -154,10 +154,10 @@ def slid(moments: Moments, rows: np.ndarray) -> Moments:
 
 
 def cost_of_union(moments: Moments, labels: np.ndarray, pair: np.ndarray) -> float:
-    """Return the error that one motion for both adds."""
+    """Return the error that one motion for both adds, for a point of the smaller one."""
     bodies = [moments.take(np.flatnonzero(np.isin(labels, own))) for own in ([pair[0]], [pair[1]], list(pair))]
     errors = [float(each.pooled(np.zeros(len(each.count), np.int64), 1).errors()[0]) for each in bodies]
-    return errors[2] - errors[0] - errors[1]
+    return (errors[2] - errors[0] - errors[1]) / min(float(body.count.sum()) for body in bodies)
 
 
 def merged_plainly(patches: Patches) -> np.ndarray:
@@ -170,7 +170,8 @@ def merged_plainly(patches: Patches) -> np.ndarray:
         pairs = parts._neighbors(patches.edges, labels)
         small = [pair for pair in pairs if (np.bincount(labels)[pair] < least).any()]
         if small:
-            first, second = min(small, key=lambda pair: cost_of_union(patches.moments, labels, pair))
+            large = [pair for pair in small if (np.bincount(labels)[pair] >= least).any()]
+            first, second = min(large or small, key=lambda pair: cost_of_union(patches.moments, labels, pair))
             labels = parts._renumbered(np.where(labels == second, first, labels))
             continue
         turns = relative_turns(*fit_parts(patches.moments, labels), pairs)
