@@ -7,6 +7,7 @@ class Timeline {
     Object.assign(this, { player, link, clock });
     this.place = element("tracks");
     this.chosen = null; // { name (null: all), at }
+    this.owed = 0; // frames by which arrows still move it
     this.scrubbed = (event) => {
       if (event.type === "pointerdown") {
         if (event.target.classList.contains("key")) return;
@@ -70,10 +71,9 @@ class Timeline {
       return [title, lane];
     });
     if (views.length) lanes.splice(1, 0, this.cameraLane(state));
-    const focused = this.keyed && document.activeElement?.classList.contains("key"); // by arrows, which go on
+    const focused = place.contains(document.activeElement) ? document.activeElement.its : null;
     place.replaceChildren(...lanes.flat());
-    this.asked = false;
-    if (focused) place.querySelector(".key.chosen")?.focus();
+    if (focused) this.focus(focused);
     this.head = document.createElement("div");
     this.head.id = "head";
     this.head.style.height = `${place.scrollHeight}px`;
@@ -81,6 +81,13 @@ class Timeline {
     if (state.active !== this.active) place.querySelector(".lane.tall")?.scrollIntoView({ block: "nearest" });
     this.active = state.active;
     this.tick();
+  }
+
+  // A key keeps the focus when the lanes are drawn anew, also where arrows have moved it.
+  focus({ name, at }) {
+    const keys = [...this.place.querySelectorAll(".key")];
+    const same = keys.find(({ its }) => its.name === name && its.at === at);
+    (same ?? (this.keyed ? keys.find((key) => key.classList.contains("chosen")) : null))?.focus();
   }
 
   // Views of the film's camera, on a lane of their own.
@@ -132,6 +139,7 @@ class Timeline {
     button.setAttribute("aria-label", `${name === CAMERA ? "View" : "Keyframe"} of ${name === null ? "all" : text} at ${frame.at.toFixed(2)} seconds`);
     button.title = `${beyond ? "After the end of the film. " : ""}Drag to move, with Alt to copy; Delete removes it`;
     const its = { name, at: frame.at };
+    button.its = its;
     button.classList.toggle("chosen", this.chosen?.name === name && this.chosen?.at === frame.at);
     button.addEventListener("pointerdown", (event) => {
       event.stopPropagation();
@@ -160,16 +168,11 @@ class Timeline {
         if (this.moving?.its === its) this.stay();
       });
     }
-    button.addEventListener("keydown", async (event) => {
+    button.addEventListener("keydown", (event) => {
       if (event.key === "Enter") this.choose(its);
-      if (event.key === "ArrowLeft" || event.key === "ArrowRight") {
-        event.preventDefault();
-        const to = Math.max(0, frame.at + (event.key === "ArrowLeft" ? -1 : 1) / state.film.fps);
-        if (this.asked || to === frame.at) return; // one after the other
-        this.asked = this.keyed = true;
-        this.chosen = { name, at: to };
-        if ((await this.change("move", its, { to })).problem) this.asked = false;
-      }
+      if (event.key !== "ArrowLeft" && event.key !== "ArrowRight") return;
+      event.preventDefault();
+      this.nudge(its, event.key === "ArrowLeft" ? -1 : 1);
     });
     return button;
   }
@@ -180,6 +183,23 @@ class Timeline {
     this.player.seek(its.at / this.player.seconds);
     this.shown = null;
     this.show(this.link.state);
+  }
+
+  // Moves a key by frames of the film. Those that are asked for before the answer follow it.
+  async nudge({ name, at }, frames) {
+    this.owed += frames;
+    if (this.nudging) return;
+    this.nudging = this.keyed = true;
+    while (this.owed) {
+      const to = Math.max(0, at + this.owed / this.link.state.film.fps);
+      this.owed = 0;
+      if (to === at) break;
+      this.chosen = { name, at: to };
+      if ((await this.change("move", { name, at }, { to })).problem) break;
+      at = to;
+    }
+    this.owed = 0;
+    this.nudging = false;
   }
 
   change(what, its, fields = {}) {
