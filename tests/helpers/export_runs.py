@@ -24,8 +24,12 @@ def save(scene: Scene, folder: Path) -> Path:
     return folder
 
 
-def moving_run(folder: Path, masked: bool = False) -> Path:
-    """Write a run whose network moves things a little, with shading and correctives."""
+def moving_run(folder: Path, masked: bool = False, swing: float = 0.3) -> Path:
+    """Write a run whose network moves things a little, with shading and correctives.
+
+    Args:
+        swing: size of the network's random weights; at 0.02 the body holds together, and its parts hang on each other.
+    """
     like = bar_scene(nodes=24, gaussians=120, shaded=True, corrected=True, share=0.5 if masked else None)
     fields = {"nodes": 24, "layers": 3, "width": 32, "skip": 2, "mask": masked}
     config = from_dict({"motion": fields, "sharpness": 0.0})
@@ -37,7 +41,7 @@ def moving_run(folder: Path, masked: bool = False) -> Path:
     torch.manual_seed(0)
     with torch.no_grad():
         for parameter in motion.network.parameters():
-            parameter.copy_(0.3 * torch.randn_like(parameter))
+            parameter.copy_(swing * torch.randn_like(parameter))
     if masked:
         with torch.no_grad():
             like.gaussians.hyper[:, -1] = torch.linspace(-60.0, 8.0, len(like.gaussians.hyper))

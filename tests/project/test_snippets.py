@@ -22,7 +22,7 @@ RUNS = ("figure-quick", "NAME")
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory) -> Path:
-    return moving_run(tmp_path_factory.mktemp("runs") / "run")
+    return moving_run(tmp_path_factory.mktemp("runs") / "run", swing=0.02)
 
 
 @pytest.mark.parametrize("page", PAGES)
