@@ -160,7 +160,7 @@ def test_a_key_follows_the_arrows_and_escape_leaves_it(browser, editor):
     keys = page.locator("#tracks .ruler .key")
     until(lambda: keys.count() == 2)
     keys.nth(1).focus()
-    window.ask("(studio.timeline.shown = null, studio.timeline.show(studio.link.state))")  # as another page has it drawn
+    window.ask("(studio.timeline.shown = null, studio.timeline.show(studio.link.state))")  # another page changed it
     for step in range(1, 4):
         page.keyboard.press("ArrowRight")
         moment = 1.0 + step / editor.session.edit.film.fps
