@@ -17,7 +17,7 @@ from ..errors import UserError
 from ..runtime.progress import progress
 from ..storage.json_files import as_number
 from ..visualization.video import write_png
-from . import features, mapping, moving, picking, pictures, writing
+from . import bundle_adjustment, features, mapping, moving, picking, pictures, writing
 from .colmap import remove_database
 from .completeness import Incomplete
 from .diagnosis import Outcome, notes, too_few
@@ -300,7 +300,7 @@ def _solve(
     show: ShowProgress,
 ) -> tuple[Outcome, mapping.CameraSolution | None]:
     """Run the stages of features, matches and cameras."""
-    database, model = journal.work / "database.db", journal.work / "model"
+    database, model, adjusted = (journal.work / name for name in ("database.db", "model", "adjusted"))
     count = len(frame_files.names)
     focal = None if request.fov is None else 0.5 * frames.size[0] / math.tan(math.radians(request.fov) / 2)
     chosen = features.pairs(count, request.matching, source.video)
@@ -318,10 +318,19 @@ def _solve(
         with show(count, "cameras") as bar:
             return mapping.solve(database, frame_files, model, request.seed, lambda: bar.done < count and bar.advance())
 
+    def adjust() -> None:
+        with show(bundle_adjustment.ROUNDS, "adjusting cameras") as bar:
+            bundle_adjustment.adjust_model(model, adjusted, bar.advance)
+
     settings = [request.camera_model, request.fov, request.features]
     journal.stage("features", settings, find, lambda: remove_database(database))
     journal.stage("matches", [request.matching, request.seed], compare, lambda: features.forget(database))
-    journal.stage("cameras", request.seed, solve_cameras, lambda: shutil.rmtree(model, ignore_errors=True))
+    found = journal.stage("cameras", request.seed, solve_cameras, lambda: shutil.rmtree(model, ignore_errors=True))
+    if found and (
+        not journal.finished or journal.knows("adjustment")
+    ):  # Folders of earlier versions have no such stage.
+        journal.stage("adjustment", None, adjust, lambda: shutil.rmtree(adjusted, ignore_errors=True))
+        model = adjusted
     solved = mapping.read_solution(model, frame_files)
     masked = 0.0 if frame_files.masks is None else _share(journal)
     registered, arc = (len(solved.places), solved.arc) if solved else (0, 0.0)

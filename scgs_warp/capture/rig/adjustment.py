@@ -22,10 +22,11 @@ from ...geometry.optical_flow import at_targets, dense_flow, returns, targets_of
 from ...geometry.stereo import StereoPair, stereo_pairs
 from ...geometry.view_rays import pixels_of, ray_of
 from ...types import Camera
+from ..bundle_adjustment import median_error
 from ..colmap import quiet, read_model, write_model
 from ..features import FrameFiles
 from ..source import read_rgb
-from .cameras import RigCamera, median_error, solution_of, straightened
+from .cameras import RigCamera, solution_of, straightened
 from .points import lens_of
 from .writing import common_pinholes
 

@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ..bundle_adjustment import adjust
 from ..colmap import database_errors, quiet, read_model, write_model
 from ..features import FrameFiles
 from ..mapping import MAX_ERROR
@@ -20,8 +21,6 @@ FEW_INLIERS = (100, 50, 25)
 """Smallest numbers of matches of the first pair of cameras, tried one after the other: cameras of a rig stand far
 apart."""
 
-ROBUST = 0.5
-"""Reprojection error, pixels, beyond which an observation pulls less and less."""
 LENS_GAIN = 0.01
 """Least share by which distortion must lower the median reprojection error. A few pictures can hardly tell distortion
 from focal length, and a distortion that explains next to nothing bends the scene."""
@@ -93,38 +92,15 @@ def straightened(model: Any) -> Any:
         return model
     if not any(len(lens.extra_params_idxs()) for lens in model.cameras.values()):
         straight = copy.deepcopy(model)
-        _adjusted(straight, False)
+        adjust(straight, distortion=False)
         return straight
     bent, straight = copy.deepcopy(model), copy.deepcopy(model)
     for lens in straight.cameras.values():
         params = np.array(lens.params)
         params[lens.extra_params_idxs()] = 0.0
         lens.params = params
-    errors = [_adjusted(bent, True), _adjusted(straight, False)]
+    errors = [adjust(bent, distortion=True), adjust(straight, distortion=False)]
     return straight if errors[1] * (1.0 - LENS_GAIN) <= errors[0] else bent
-
-
-def _adjusted(model: Any, distortion: bool) -> float:
-    """Adjust a model in place, its distortion if asked; return the median error."""
-    with quiet() as pycolmap:
-        options = pycolmap.BundleAdjustmentOptions()
-        options.print_summary, options.refine_extra_params = False, distortion
-        options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
-        options.ceres.loss_function_scale = ROBUST
-        options.ceres.solver_options.num_threads = 1
-        # pycolmap.bundle_adjustment would write to the user's terminal.
-        config = pycolmap.BundleAdjustmentConfig()
-        for image in model.reg_image_ids():
-            config.add_image(image)
-        config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
-        pycolmap.create_default_bundle_adjuster(options, config, model).solve()
-    return median_error(model)
-
-
-def median_error(model: Any) -> float:
-    """Return the median over a model's points of the mean reprojection error, pixels; strays would dominate a mean."""
-    model.update_point_3d_errors()
-    return float(np.median([point.error for point in model.points3D.values()])) if model.points3D else 0.0
 
 
 def read_solution(folder: Path, names: Sequence[str]) -> RigSolution | None:
