@@ -6,8 +6,9 @@ fixed capacity: a step that needs more changes nothing, nor does its successor, 
 Steps that consist of the same operations are recorded as a CUDA graph and replayed.
 
 The result is that of ``step.training_step``, which takes the steps that cannot be taken this way: those of several
-views, of refined cameras, of frames with affine colours, that compare flow, with debug checks, or with lists beyond the
-memory. On a CPU the same operations run one by one, which is how they are tested.
+views, of refined cameras, of frames with affine colours, that compare flow, with debug checks, with lists beyond the
+memory, or soon after one whose view showed nothing (``vanishing``). On a CPU the same operations run one by one, which
+is how they are tested.
 """
 
 from __future__ import annotations
@@ -29,6 +30,7 @@ from .frames import Frames
 from .recorded_update import Kind, RecordedUpdate
 from .state import StepResult, TrainState
 from .step import set_rates, training_step
+from .vanishing import RECALLED, should_show
 from .view import View, prepare
 
 PAIRS_PER_GAUSSIAN = 4
@@ -87,6 +89,7 @@ class RecordedSteps:
         self._records_from: dict[Hashable, int] = {}
         self._told: set[bool] = set()
         self._most_pairs = 0
+        self._recalls_until = 0
         self._memory = GraphMemory()
         self._pending: deque[_Submitted] = deque()
         self._update: RecordedUpdate | None = None
@@ -133,7 +136,7 @@ class RecordedSteps:
         ready = state.motion.takes_time_tensor and not state.refines_cameras and not len(state.exposure)
         if state.stage == "main":
             ready = ready and not flow_applies(state.stage_step, state.config)
-        if not ready or debug.enabled():
+        if not ready or debug.enabled() or state.step < self._recalls_until:
             return False
         if self.capacity > 0 and self._update is not None and self._update.holds():
             return True
@@ -210,6 +213,8 @@ class RecordedSteps:
         if outcome == STEP_HALTED:
             return self._repeat(int(pairs))
         self._pending.popleft()
+        if pairs == 0 and should_show(l1):
+            self._recalls_until = first.step.number + RECALLED
         failed = None if outcome == STEP_FINE else _name(int(outcome), first.kind.names)
         if failed is not None:
             _take_back(first)

@@ -16,6 +16,9 @@ from .state import TrainState
 RECALL = 0.2
 """Weight of the distance by which Gaussians that a view does not show are drawn back: about as strong as the image loss
 draws all of them together."""
+RECALLED = 50
+"""Number of steps on a GPU, after one whose view shows nothing, for which the host waits to see whether it must draw
+back Gaussians."""
 LEAST_DIFFERENCE = 1e-4
 """Difference from the truth above which an empty picture should show something."""
 VIEWS = 20
@@ -34,18 +37,19 @@ def recall(means: Tensor, alpha: Tensor, l1: Tensor) -> Tensor | None:
         l1: scalar, difference between the picture and the truth.
 
     Returns:
-        ``RECALL`` times the mean distance to the region that all cameras see, 0 where the view shows something; None
-        if that is known without waiting for a GPU.
+        ``RECALL`` times the mean distance to the region that all cameras see; None where the view shows something.
     """
-    lost = (alpha.detach().amax() == 0) & (l1.detach() > LEAST_DIFFERENCE)
-    if lost.device.type == "cpu" and not lost:
+    if alpha.detach().any() or not should_show(float(l1.detach())):
         return None
     far = means.detach().norm(dim=1)
-    chosen = (
-        lost & far.isfinite() & (far > COMMON_RADIUS)
-    )  # what is not chosen gets a gradient of 0, also if not finite
+    chosen = far.isfinite() & (far > COMMON_RADIUS)  # what is not chosen gets a gradient of 0, also if not finite
     distances = torch.where(chosen[:, None], means, 0.0).norm(dim=1) - COMMON_RADIUS * chosen
     return RECALL * distances.sum() / len(means)
+
+
+def should_show(l1: float) -> bool:
+    """Return whether an empty picture that differs by ``l1`` from the truth should show something."""
+    return l1 > LEAST_DIFFERENCE
 
 
 def refuse_empty(state: TrainState, data: Dataset, folder: Path) -> None:

@@ -176,7 +176,7 @@ def compare(
     loss, l1, ssim = photometric_loss(picture, view.truth, view.mask, config.loss.ssim, form.log_weight)
     if form.pooled:
         loss = loss + pooled_residual(picture, view.truth, view.mask)
-    recalled = recall(posed.means, alpha, l1)
+    recalled = recall(posed.means, alpha, l1) if binned is None else None  # else the host must not wait
     if recalled is not None:
         regulariser = recalled if regulariser is None else regulariser + recalled
     total = loss if regulariser is None else loss + regulariser

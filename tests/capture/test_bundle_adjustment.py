@@ -63,7 +63,7 @@ def errors(made) -> np.ndarray:
     found = np.stack([made.images[view + 1].projection_center() for view in range(VIEWS)])
     true = np.stack([centre(view) for view in range(VIEWS)])
     a, b = found - found.mean(0), true - true.mean(0)
-    u, s, vt = np.linalg.svd(b.T @ a)
+    u, _, vt = np.linalg.svd(b.T @ a)
     turn = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
     scale = np.trace(turn @ a.T @ b) / np.square(a).sum()
     return np.linalg.norm(scale * a @ turn.T - b, axis=1) / np.linalg.norm(np.diff(true, axis=0), axis=1).sum()

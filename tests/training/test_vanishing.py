@@ -14,6 +14,7 @@ from scgs_warp.scene.scene import Scene
 from scgs_warp.training import loop, vanishing
 from scgs_warp.training.frames import Frames
 from scgs_warp.training.loop import fit
+from scgs_warp.training.recorded_step import RecordedSteps
 from scgs_warp.training.state import TrainState
 from scgs_warp.training.step import training_step
 from scgs_warp.training.vanishing import recall, shows_nothing
@@ -22,15 +23,15 @@ AWAY = 10.0
 """Distance, normalised, at which no view shows anything."""
 
 
-def state_away(**changes) -> tuple[TrainState, Frames]:
+def state_away(device: str = "cpu", **changes) -> tuple[TrainState, Frames]:
     """A static scene whose Gaussians all lie behind some camera and beside the others."""
     data = tiny_dataset(4)
-    state = TrainState.begin(tiny_config(20, motion={"model": "static"}, **changes), data, "cpu")
+    state = TrainState.begin(tiny_config(20, motion={"model": "static"}, **changes), data, device)
     cameras = [state.normalisation.apply_camera(camera) for camera in data.cameras]
     outward = torch.stack([camera.position for camera in cameras]).mean(0)
     with torch.no_grad():
-        state.gaussians.means.add_(AWAY * outward / outward.norm())
-    return state, Frames(data, state.normalisation, state.config, "cpu")
+        state.gaussians.means.add_((AWAY * outward / outward.norm()).to(device))
+    return state, Frames(data, state.normalisation, state.config, device)
 
 
 def test_gaussians_that_no_view_shows_are_drawn_back():
@@ -38,6 +39,20 @@ def test_gaussians_that_no_view_shows_are_drawn_back():
     assert shows_nothing(state.scene(), frames.frames)
     before = state.gaussians.means.detach().norm(dim=1).mean()
     training_step(state, frames)
+    assert state.gaussians.means.detach().norm(dim=1).mean() < before
+
+
+def test_steps_that_the_host_does_not_wait_for_find_out_later(device):
+    state, frames = state_away(device)
+    before, steps = state.gaussians.means.detach().norm(dim=1).mean(), RecordedSteps(state, frames)
+    for _ in range(2):  # the results of the second are not known before the third
+        steps.take()
+        state.step += 1
+    assert state.gaussians.means.detach().norm(dim=1).mean() == before
+    for _ in range(2):
+        (result,) = [*steps.settle(), *steps.take()][-1:]
+        assert result.failed is None
+        state.step += 1
     assert state.gaussians.means.detach().norm(dim=1).mean() < before
 
 

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 from helpers import textured_corner as corner
+from scgs_warp.capture.bundle_adjustment import median_error
 from scgs_warp.capture.colmap import quiet
 from scgs_warp.capture.rig import adjustment
-from scgs_warp.capture.bundle_adjustment import median_error
 from scgs_warp.capture.rig.cameras import read_solution, solution_of
 from scgs_warp.geometry import stereo
 from scgs_warp.geometry.view_rays import pixels_of
