@@ -4,17 +4,25 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
-from typing import Literal
+from itertools import pairwise
+from typing import Any, Literal, get_args
 
 import numpy as np
 
+from ..errors import UserError
+from .field_reader import FieldReader, check_record
 from .handles import ONE_FRAME, Handle, Target, Vector3
-from .keyframes import Keyframe
+from .keyframes import MAX_SECONDS, Keyframe
 from .part_skin import SkinName
 from .playback import Exaggerate, Hold, Playback
 from .skeleton import Skeleton
+
+ShotKind = Literal["turntable", "fixed", "orbit"]
+
+MAX_FILM_SIZE = 8192
+"""Longer side in pixels."""
 
 
 @dataclass(frozen=True)
@@ -32,12 +40,34 @@ class View:
     target: Vector3 | None = None
     """Point that the camera looks at, world units."""
 
+    def __post_init__(self) -> None:
+        """
+        Raises:
+            UserError: naming the field.
+        """
+        check_record(self, "view", view_fields)
+
+
+def view_fields(node: FieldReader) -> dict[str, Any]:
+    """Read all fields of a view.
+
+    Raises:
+        UserError: naming the field.
+    """
+    return {
+        "at": node.number("at", 0.0, 0.0, MAX_SECONDS),
+        "azimuth": node.number("azimuth", None, -1e5, 1e5),
+        "elevation": node.number("elevation", None, -80.0, 80.0),
+        "distance": node.number("distance", None, 1e-9),
+        "target": node.vector("target", 3),
+    }
+
 
 @dataclass(frozen=True)
 class Shot:
     """Path of the film's camera."""
 
-    kind: Literal["turntable", "fixed", "orbit"] = "turntable"
+    kind: ShotKind = "turntable"
     """turntable: ``turns`` around the scene from the first view; fixed: the first view throughout; orbit: smoothly
     through all views."""
     views: tuple[View, ...] = (View(),)
@@ -45,6 +75,41 @@ class Shot:
     up: Vector3 | None = None
     fov: float | None = None
     """Horizontal, degrees."""
+
+    def __post_init__(self) -> None:
+        """Check and convert the fields, and put the views in order.
+
+        Raises:
+            UserError: naming the field.
+        """
+        read = lambda node: {"views": ordered_views(node, node.records("views", View)), **shot_fields(node)}  # noqa: E731
+        check_record(self, "shot", read)
+
+
+def shot_fields(node: FieldReader) -> dict[str, Any]:
+    """Read all fields of a shot but its views.
+
+    Raises:
+        UserError: naming the field.
+    """
+    return {
+        "kind": node.choice("kind", get_args(ShotKind), "turntable"),
+        "turns": node.number("turns", 1.0, -1000.0, 1000.0),
+        "up": node.direction("up"),
+        "fov": node.number("fov", None, 1.0, 150.0),
+    }
+
+
+def ordered_views(node: FieldReader, views: Iterable[View]) -> tuple[View, ...]:
+    """Return a shot's views in their order, one if there is none.
+
+    Raises:
+        UserError: two are at one moment.
+    """
+    ordered = sorted(views, key=lambda view: view.at)
+    if any(a.at == b.at for a, b in pairwise(ordered)):
+        raise node.wrong("views", "has two at one moment", "give every view a moment of its own")
+    return tuple(ordered) or (View(),)
 
 
 @dataclass(frozen=True)
@@ -58,9 +123,30 @@ class Film:
     background: Vector3 | None = None
     shot: Shot = Shot()
 
+    def __post_init__(self) -> None:
+        """
+        Raises:
+            UserError: naming the field.
+        """
+        check_record(self, "film", lambda node: {"shot": node.record("shot", Shot) or Shot(), **film_fields(node)})
+
     @property
     def frames(self) -> int:
         return max(1, round(self.seconds * self.fps))
+
+
+def film_fields(node: FieldReader) -> dict[str, Any]:
+    """Read all fields of a film but its shot.
+
+    Raises:
+        UserError: naming the field.
+    """
+    return {
+        "seconds": node.number("seconds", 4.0, 1e-3, MAX_SECONDS),
+        "fps": node.number("fps", 30.0, 0.01, 1000.0),
+        "size": node.integer("size", 512, 16, MAX_FILM_SIZE),
+        "background": node.vector("background", 3, None, 0.0, 1.0),
+    }
 
 
 @functools.lru_cache(maxsize=16)
@@ -99,6 +185,30 @@ class Edit:
     joint, and widen where the surface stretches; dual: the same, and motions blend as dual quaternions; nodes: by their
     trained weights, as they follow handles of control points."""
 
+    def __post_init__(self) -> None:
+        """Check the kinds of the fields, whose records check themselves, and put the keyframes in order.
+
+        Raises:
+            UserError: naming the field.
+        """
+        check_record(self, "edit", _edit_fields)
+
+    def check_nodes(self, count: int) -> None:
+        """Check that the scene has the control points that the edit names.
+
+        Args:
+            count: number of the scene's control points.
+
+        Raises:
+            UserError: naming the field.
+        """
+        regions = {"pins": self.pins, **{f"handle {handle.name!r}": handle.nodes for handle in self.handles}}
+        regions |= {f"hold[{row}]": hold.nodes for row, hold in enumerate(self.holds)}
+        regions |= {"exaggerate": () if self.exaggerate is None else self.exaggerate.nodes}
+        for name, nodes in regions.items():
+            if nodes and nodes[-1] >= count:
+                raise UserError(f"{name}: control point {nodes[-1]}: there are {count}, from 0 on; choose among them")
+
     @property
     def reach(self) -> float:
         """Largest distance from a handle's time, in scene time, at which a one-frame edit still shows."""
@@ -131,3 +241,22 @@ class Edit:
 
     def handle(self, name: str) -> Handle | None:
         return next((handle for handle in self.handles if handle.name == name), None)
+
+
+def _edit_fields(node: FieldReader) -> dict[str, Any]:
+    frames = sorted(node.records("keyframes", Keyframe), key=lambda frame: frame.at)
+    for first, second in pairwise(frames):
+        if first.at == second.at:
+            raise node.wrong("keyframes", f"has two at {first.at:g} s", "leave one of them out")
+    return {
+        "handles": node.records("handles", Handle),
+        "pins": node.indices("pins"),
+        "targets": node.named_records("targets", Target),
+        "keyframes": tuple(frames),
+        "playback": node.record("playback", Playback) or Playback(),
+        "holds": node.records("holds", Hold),
+        "exaggerate": node.record("exaggerate", Exaggerate),
+        "film": node.record("film", Film) or Film(),
+        "skeleton": node.record("skeleton", Skeleton),
+        "skin": node.choice("skin", get_args(SkinName), "parts"),
+    }

@@ -15,21 +15,19 @@ import numpy as np
 from ..errors import UserError
 from ..motion.static_nodes import MAX_COUNT
 from . import skeleton_file
-from .document import Edit, Film, Shot, View
+from .document import Edit, Film, Shot, View, film_fields, ordered_views, shot_fields, view_fields
 from .engine import Engine
 from .field_reader import FieldReader, one_line, read_object, show_value
 from .handles import Handle, Target, handle_fields
-from .keyframes import MAX_SECONDS, Keyframe, keyframe_fields
+from .keyframes import Keyframe, keyframe_fields
 from .part_skin import SkinName
-from .playback import LIMITS, Exaggerate, Hold, Playback
+from .playback import Exaggerate, Hold, Playback, exaggerate_fields, hold_fields, playback_fields
 from .rotations import from_axis
 from .skeleton import Skeleton
 
 FORMAT = "scgs-warp edit"
 VERSION = 2
 """In version 1, a handle of several control points without ``turns`` fixed their rotations."""
-MAX_FILM_SIZE = 8192
-"""Longer side in pixels."""
 
 
 def fingerprint(engine: Engine) -> str:
@@ -148,7 +146,7 @@ def parse(content: Any, source: str, engine: Engine, default: Callable[[], Skele
         playback=_playback(root.child("playback")),
         holds=tuple(_hold(fields, engine) for fields in root.children("hold", 1000)),
         exaggerate=_exaggerate(root.child("exaggerate"), engine),
-        film=film_of(root.child("film")),
+        film=_film(root.child("film")),
         skeleton=skeleton,
         skin=root.choice("skin", get_args(SkinName), "parts"),
     )
@@ -237,11 +235,6 @@ def _handle(
     return Handle(nodes=skeleton.part(part).nodes, **values), skeleton
 
 
-def _too_short(direction: tuple[float, ...]) -> bool:
-    """Return whether a direction is too short to be normalised."""
-    return not sum(x * x for x in direction) > 1e-200
-
-
 def _pins(root: FieldReader, handles: list[Handle], engine: Engine) -> tuple[int, ...]:
     value = root.raw("pins")
     if value is None or value == []:
@@ -256,14 +249,12 @@ def _pins(root: FieldReader, handles: list[Handle], engine: Engine) -> tuple[int
 
 def _target(fields: FieldReader) -> Target:
     """Read a target, whose turn is either a quaternion (``rotation``, wxyz) or ``axis`` and ``degrees``."""
-    rotation, axis = fields.vector("rotation", 4), fields.vector("axis", 3)
+    rotation, axis = fields.vector("rotation", 4), fields.direction("axis")
     degrees = fields.number("degrees", None, -180.0, 180.0)
     translation = fields.vector("translation", 3)
     if (axis is None) != (degrees is None) or (rotation is not None and axis is not None):
         raise fields.wrong("axis", "and degrees belong together", "give both, or rotation alone")
     if axis is not None:
-        if _too_short(axis):
-            raise fields.wrong("axis", "has no direction", "give 3 numbers, not all close to 0")
         rotation = tuple(from_axis(axis, degrees).tolist())
     fields.done()
     try:
@@ -290,31 +281,14 @@ def _keyframe(fields: FieldReader, names: set[str]) -> Keyframe:
 def _playback(fields: FieldReader | None) -> Playback:
     if fields is None:
         return Playback()
-    pairs = []
-    for index, pair in enumerate(fields.items("map")):
-        reader = FieldReader({"pair": pair}, fields.source, f"{fields.path}.map[{index}]")
-        at, time = reader.vector("pair", 2) or (0.0, -1.0)
-        if not (0.0 <= time <= 1.0 and at >= 0.0 and (not pairs or at > pairs[-1][0])):
-            raise fields.wrong(
-                f"map[{index}]", f"is [{at:g}, {time:g}]", "give rising seconds and scene times in [0, 1]"
-            )
-        pairs.append((at, time))
-    playback = Playback(
-        seconds=fields.number("seconds", None, *LIMITS["seconds"]),
-        speed=fields.number("speed", 1.0, *LIMITS["speed"]),
-        start=fields.number("start", 0.0, *LIMITS["start"]),
-        repeat=fields.choice("repeat", ("once", "loop", "swing"), "once"),
-        freeze=fields.number("freeze", None, *LIMITS["freeze"]),
-        map=tuple(pairs),
-    )
+    playback = Playback(**playback_fields(fields))
     fields.done()
     return playback
 
 
 def _hold(fields: FieldReader, engine: Engine) -> Hold:
-    time = fields.number("time", 0.0, 0.0, 1.0)
-    frame = fields.choice("frame", ("body", "world"), "body")
-    hold = Hold(_nodes(fields, "nodes", engine, time=time), time, frame, fields.integer("rings", 2, 0, 100))
+    values = hold_fields(fields)
+    hold = Hold(_nodes(fields, "nodes", engine, time=values["time"]), **values)
     fields.done("comment")
     return hold
 
@@ -323,26 +297,15 @@ def _exaggerate(fields: FieldReader | None, engine: Engine) -> Exaggerate | None
     if fields is None:
         return None
     nodes = () if fields.raw("nodes") in (None, []) else _nodes(fields, "nodes", engine)
-    exaggerate = Exaggerate(fields.number("factor", 1.5, -10.0, 10.0), fields.number("about", None, 0.0, 1.0), nodes)
+    exaggerate = Exaggerate(nodes=nodes, **exaggerate_fields(fields))
     fields.done("comment")
     return exaggerate
 
 
-def film_of(fields: FieldReader | None) -> Film:
-    """Read a film's settings.
-
-    Raises:
-        UserError: naming the field.
-    """
+def _film(fields: FieldReader | None) -> Film:
     if fields is None:
         return Film()
-    film = Film(
-        seconds=fields.number("seconds", 4.0, 1e-3, MAX_SECONDS),
-        fps=fields.number("fps", 30.0, 0.01, 1000.0),
-        size=fields.integer("size", 512, 16, MAX_FILM_SIZE),
-        background=fields.vector("background", 3, None, 0.0, 1.0),
-        shot=_shot(fields.child("shot")),
-    )
+    film = Film(shot=_shot(fields.child("shot")), **film_fields(fields))
     fields.done()
     return film
 
@@ -352,27 +315,8 @@ def _shot(fields: FieldReader | None) -> Shot:
         return Shot()
     views = []
     for view in fields.children("views"):
-        views.append(
-            View(
-                at=view.number("at", 0.0, 0.0, MAX_SECONDS),
-                azimuth=view.number("azimuth", None, -1e5, 1e5),
-                elevation=view.number("elevation", None, -80.0, 80.0),
-                distance=view.number("distance", None, 1e-9),
-                target=view.vector("target", 3),
-            )
-        )
+        views.append(View(**view_fields(view)))
         view.done()
-    views.sort(key=lambda view: view.at)
-    shot = Shot(
-        kind=fields.choice("kind", ("turntable", "fixed", "orbit"), "turntable"),
-        views=tuple(views) or (View(),),
-        turns=fields.number("turns", 1.0, -1000.0, 1000.0),
-        up=fields.vector("up", 3),
-        fov=fields.number("fov", None, 1.0, 150.0),
-    )
-    if shot.up is not None and _too_short(shot.up):
-        raise fields.wrong("up", "has no direction", "give 3 numbers, not all close to 0")
-    if any(a.at == b.at for a, b in pairwise(views)):
-        raise fields.wrong("views", "has two at one moment", "give every view a moment of its own")
+    shot = Shot(views=ordered_views(fields, views), **shot_fields(fields))
     fields.done()
     return shot

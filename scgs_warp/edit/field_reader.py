@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -67,6 +67,9 @@ def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
         twice = next(name for name in names if names.count(name) > 1)
         raise ValueError(f"{twice!r} stands there twice")
     return content
+
+
+Record = TypeVar("Record")
 
 
 class FieldReader:
@@ -153,9 +156,14 @@ class FieldReader:
             return default
         fits = isinstance(value, list | tuple) and len(value) == size and all(map(_is_number, value))
         if not fits or not all(low <= x <= high for x in value):
-            limits = "" if high == MAX_NUMBER else f" from {low:g} to {high:g}"
-            raise self.wrong(name, f"is {show_value(value)}", f"give {size} numbers{limits}")
+            raise self.wrong(name, f"is {show_value(value)}", f"give {size} numbers from {low:g} to {high:g}")
         return tuple(float(x) for x in value)
+
+    def direction(self, name: str) -> Any:
+        value = self.vector(name, 3)
+        if value is not None and not sum(x * x for x in value) > 1e-200:
+            raise self.wrong(name, "has no direction", "give 3 numbers, not all close to 0")
+        return value
 
     def items(self, name: str, most: int = 100_000) -> list[Any]:
         value = self.raw(name)
@@ -163,6 +171,37 @@ class FieldReader:
             return []
         if not isinstance(value, list) or len(value) > most:
             raise self.wrong(name, f"is {show_value(value)}", f"give a list of at most {most}")
+        return value
+
+    def indices(self, name: str, least: int = 0) -> tuple[int, ...]:
+        """Return whole numbers from 0 on, at least ``least`` of them, ascending; the scene says which exist."""
+        value = self.items(name)
+        if len(value) < least:
+            raise self.wrong(name, "is missing or empty", "list control points")
+        for index in value:
+            if isinstance(index, bool) or not isinstance(index, int) or index < 0:
+                raise self.wrong(name, f"names control point {show_value(index)}", "give whole numbers from 0 on")
+        return tuple(sorted(set(value)))
+
+    def records(self, name: str, kind: type[Record]) -> tuple[Record, ...]:
+        """Return records that a caller has made, which check their own fields."""
+        value = self.raw(name)
+        value = [] if value is None else value
+        if not isinstance(value, list | tuple) or not all(isinstance(item, kind) for item in value):
+            raise self.wrong(name, f"is {show_value(value)}", f"give a list of {kind.__name__}")
+        return tuple(value)
+
+    def named_records(self, name: str, kind: type[Record]) -> dict[str, Record]:
+        value = self.raw(name)
+        value = {} if value is None else value
+        if not isinstance(value, Mapping) or not all(isinstance(item, kind) for item in value.values()):
+            raise self.wrong(name, f"is {show_value(value)}", f"give a mapping of names to {kind.__name__}")
+        return dict(value)
+
+    def record(self, name: str, kind: type[Record]) -> Record | None:
+        value = self.raw(name)
+        if value is not None and not isinstance(value, kind):
+            raise self.wrong(name, f"is {show_value(value)}", f"give {kind.__name__}(...)")
         return value
 
     def child(self, name: str) -> FieldReader | None:
@@ -185,14 +224,28 @@ class FieldReader:
 
 
 def plain_values(fields: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the fields with NumPy's numbers and arrays as Python's, also inside lists and tuples."""
+    """Return the fields with arrays and tensors as Python's numbers and lists, also inside lists and tuples."""
 
     def plain(value: Any) -> Any:
-        if isinstance(value, (np.generic, np.ndarray)):
+        if hasattr(value, "tolist"):
             return value.tolist()
         return [plain(item) for item in value] if isinstance(value, (list, tuple)) else value
 
     return {name: plain(value) for name, value in fields.items()}
+
+
+def check_record(record: Any, source: str, read: Callable[[FieldReader], dict[str, Any]]) -> None:
+    """Check and convert the fields of a frozen record that a caller makes, as those of a file are.
+
+    Args:
+        source: name of the record in error messages.
+        read: reads the fields that it returns.
+
+    Raises:
+        UserError: naming the field and the remedy.
+    """
+    for name, value in read(FieldReader(plain_values(vars(record)), source)).items():
+        object.__setattr__(record, name, value)
 
 
 def point_of(name: str, value: Sequence[float]) -> np.ndarray:

@@ -5,15 +5,16 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from sys import float_info
 from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 
 from ..errors import UserError
-from .field_reader import MAX_NUMBER, FieldReader, plain_values
+from .field_reader import FieldReader, check_record
 from .graph import ControlGraph
 from .rigid_groups import RigidGroups
-from .rotations import IDENTITY, angle, conjugate, multiply, power, rigid_fit, rotate, to_matrix, unit
+from .rotations import angle, conjugate, multiply, power, rigid_fit, rotate, to_matrix, unit
 from .solver import Anchors
 
 Vector3 = tuple[float, float, float]
@@ -43,10 +44,9 @@ class Target:
     def __post_init__(self) -> None:
         """
         Raises:
-            UserError: a number is not finite.
+            UserError: naming the field.
         """
-        if not all(map(math.isfinite, (*self.translation, *self.rotation))):
-            raise UserError(f"target {list(self.translation)}, {list(self.rotation)}: give finite numbers")
+        check_record(self, "target", _target_fields)
 
     @staticmethod
     def of(translation: Sequence[float] | None = None, rotation: Sequence[float] | None = None) -> Target:
@@ -55,21 +55,25 @@ class Target:
         Raises:
             UserError: a number is not finite or too large, or the rotation has no direction.
         """
-        moved = tuple(float(x) for x in (translation if translation is not None else (0.0, 0.0, 0.0)))
-        turned = tuple(float(x) for x in (rotation if rotation is not None else IDENTITY))
-        if len(moved) != 3 or not all(math.isfinite(x) and abs(x) <= MAX_NUMBER for x in moved):
-            limits = f"must be three finite numbers from {-MAX_NUMBER:g} to {MAX_NUMBER:g}"
-            raise UserError(f"translation {list(moved)}: {limits}; the handle stays where it is")
-        if len(turned) != 4 or not all(map(math.isfinite, turned)) or not any(turned):
-            raise UserError(f"rotation {list(turned)}: must be four finite numbers, not all 0; the handle stays")
+        target = Target(translation, rotation)  # type: ignore[arg-type]
+        turned = target.rotation
+        if not any(turned):
+            raise UserError("target: rotation has no direction; give 4 numbers, not all 0")
         if abs(math.fsum(x * x for x in turned) - 1.0) > 1e-12:
             scale = max(map(abs, turned))
-            turned = tuple(unit(np.array(turned) / scale).tolist())
-        return Target(moved, turned)  # type: ignore[arg-type]
+            target = Target(target.translation, tuple(unit(np.array(turned) / scale).tolist()))
+        return target
 
     @property
     def is_identity(self) -> bool:
         return not any(self.translation) and not any(self.rotation[1:])
+
+
+def _target_fields(node: FieldReader) -> dict[str, Any]:
+    return {
+        "translation": node.vector("translation", 3, (0.0, 0.0, 0.0)),
+        "rotation": node.vector("rotation", 4, (1.0, 0.0, 0.0, 0.0), -float_info.max, float_info.max),
+    }
 
 
 STAY = Target()
@@ -101,13 +105,14 @@ class Handle:
     target turns it about its joint (or ``pivot``), relative to its parent and to the motion."""
 
     def __post_init__(self) -> None:
-        """Check and convert all fields but the nodes, whose range depends on the scene.
+        """Check and convert the fields; which nodes there are, the scene says.
 
         Raises:
             UserError: naming the field.
         """
-        for name, value in handle_fields(FieldReader(plain_values(vars(self)), f"handle {self.name!r}")).items():
-            object.__setattr__(self, name, value)
+        check_record(
+            self, f"handle {self.name!r}", lambda node: {"nodes": node.indices("nodes", 1), **handle_fields(node)}
+        )
 
     def moves_freely(self, turned: bool) -> bool:
         """Return whether the nodes move as a free rigid body.

@@ -10,7 +10,7 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
-from .field_reader import FieldReader, plain_values
+from .field_reader import FieldReader, check_record
 from .handles import Target
 from .rotations import IDENTITY, conjugate, exponential, logarithm, multiply, power, slerp, unit
 
@@ -33,13 +33,14 @@ class Keyframe:
     constant speed; ease: from rest to rest; step: constant, then a jump."""
 
     def __post_init__(self) -> None:
-        """Check time and easing, and convert the time.
+        """Check and convert the fields.
 
         Raises:
             UserError: naming the field.
         """
-        for name, value in keyframe_fields(FieldReader(plain_values(vars(self)), "keyframe")).items():
-            object.__setattr__(self, name, value)
+        check_record(
+            self, "keyframe", lambda node: {"targets": node.named_records("targets", Target), **keyframe_fields(node)}
+        )
 
 
 def keyframe_fields(node: FieldReader) -> dict[str, Any]:

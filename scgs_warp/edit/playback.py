@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 
-from ..errors import UserError
+from .field_reader import FieldReader, check_record
 from .keyframes import MAX_SECONDS
 
-LIMITS = {"seconds": (1e-3, MAX_SECONDS), "speed": (-1000.0, 1000.0), "start": (0.0, 1.0), "freeze": (0.0, 1.0)}
-"""Smallest and largest value of each number of a playback."""
+Repeat = Literal["once", "loop", "swing"]
+Frame = Literal["body", "world"]
 
 
 @dataclass(frozen=True)
@@ -24,7 +24,7 @@ class Playback:
     """Speed relative to ``seconds``; negative: backwards."""
     start: float = 0.0
     """Scene time at which the film begins (``1 - start`` if it plays backwards)."""
-    repeat: Literal["once", "loop", "swing"] = "once"
+    repeat: Repeat = "once"
     """once: stop at the end; loop: jump back to the beginning; swing: play back and forth."""
     freeze: float | None = None
     """Scene time to show throughout the film."""
@@ -34,12 +34,9 @@ class Playback:
     def __post_init__(self) -> None:
         """
         Raises:
-            UserError: a number is outside its range.
+            UserError: naming the field.
         """
-        for name, (least, most) in LIMITS.items():
-            value = getattr(self, name)
-            if value is not None and not least <= value <= most:
-                raise UserError(f"playback: {name} is {value:g}; give a number from {least:g} to {most:g}")
+        check_record(self, "playback", playback_fields)
 
     def time_at(self, at: float, film_seconds: float) -> float:
         """Return the scene time in [0, 1] at a moment of the film."""
@@ -61,6 +58,33 @@ class Playback:
         return 1.0 - phase if self.speed < 0 else phase
 
 
+def playback_fields(node: FieldReader) -> dict[str, Any]:
+    """Read all fields of a playback.
+
+    Raises:
+        UserError: naming the field.
+    """
+    return {
+        "seconds": node.number("seconds", None, 1e-3, MAX_SECONDS),
+        "speed": node.number("speed", 1.0, -1000.0, 1000.0),
+        "start": node.number("start", 0.0, 0.0, 1.0),
+        "repeat": node.choice("repeat", get_args(Repeat), "once"),
+        "freeze": node.number("freeze", None, 0.0, 1.0),
+        "map": _map(node),
+    }
+
+
+def _map(node: FieldReader) -> tuple[tuple[float, float], ...]:
+    pairs: list[tuple[float, float]] = []
+    for index, pair in enumerate(node.items("map")):
+        name = f"map[{index}]"
+        at, time = FieldReader({name: pair}, node.source, node.path).vector(name, 2) or (0.0, -1.0)
+        if not (0.0 <= time <= 1.0 and at >= 0.0 and (not pairs or at > pairs[-1][0])):
+            raise node.wrong(name, f"is [{at:g}, {time:g}]", "give rising seconds and scene times in [0, 1]")
+        pairs.append((at, time))
+    return tuple(pairs)
+
+
 @dataclass(frozen=True)
 class Hold:
     """Region that keeps the pose it has at one moment while the rest moves."""
@@ -68,10 +92,30 @@ class Hold:
     nodes: tuple[int, ...]
     time: float = 0.0
     """Scene time of the pose that the region keeps."""
-    frame: Literal["body", "world"] = "body"
+    frame: Frame = "body"
     """body: the region still follows the surrounding body; world: it stays in place."""
     rings: int = 2
     """Number of rings of neighbours around the region that bend to join it to the rest."""
+
+    def __post_init__(self) -> None:
+        """
+        Raises:
+            UserError: naming the field.
+        """
+        check_record(self, "hold", lambda node: {"nodes": node.indices("nodes"), **hold_fields(node)})
+
+
+def hold_fields(node: FieldReader) -> dict[str, Any]:
+    """Read all fields of a hold but its nodes.
+
+    Raises:
+        UserError: naming the field.
+    """
+    return {
+        "time": node.number("time", 0.0, 0.0, 1.0),
+        "frame": node.choice("frame", get_args(Frame), "body"),
+        "rings": node.integer("rings", 2, 0, 100),
+    }
 
 
 @dataclass(frozen=True)
@@ -84,3 +128,19 @@ class Exaggerate:
     """Scene time of the pose that stays unchanged; None: the mean over time."""
     nodes: tuple[int, ...] = ()
     """Control points to which the factor applies; empty: all."""
+
+    def __post_init__(self) -> None:
+        """
+        Raises:
+            UserError: naming the field.
+        """
+        check_record(self, "exaggerate", lambda node: {"nodes": node.indices("nodes"), **exaggerate_fields(node)})
+
+
+def exaggerate_fields(node: FieldReader) -> dict[str, Any]:
+    """Read all fields of an exaggeration but its nodes.
+
+    Raises:
+        UserError: naming the field.
+    """
+    return {"factor": node.number("factor", 1.5, -10.0, 10.0), "about": node.number("about", None, 0.0, 1.0)}

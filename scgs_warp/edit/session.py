@@ -23,7 +23,7 @@ from ..types import Camera, Gaussians, Image
 from . import edit_file
 from .document import Edit
 from .engine import Engine
-from .field_reader import FieldReader, point_of
+from .field_reader import point_of
 from .graph import ControlGraph, chosen_nodes
 from .handles import STAY, Handle, Target
 from .keyframes import Easing, Keyframe
@@ -55,6 +55,7 @@ class EditSession(Posing):
         self.scene: Scene = self.engine.scene
         self.graph: ControlGraph = self.engine.graph
         self.edit = edit or Edit()
+        self.edit.check_nodes(len(self))
         self._past: deque[Edit] = deque(maxlen=HISTORY)
         self._future: list[Edit] = []
         self._before_drag: Edit | None = None
@@ -82,7 +83,12 @@ class EditSession(Posing):
     # The edit and its history
 
     def apply(self, edit: Edit) -> None:
-        """Replace the edit; undo restores the previous one."""
+        """Replace the edit; undo restores the previous one.
+
+        Raises:
+            UserError: the edit names a control point that does not exist.
+        """
+        edit.check_nodes(len(self))
         self.release()
         if edit != self.edit:
             self._past.append(self.edit)
@@ -315,7 +321,6 @@ class EditSession(Posing):
         Raises:
             UserError: the size is out of range.
         """
-        edit_file.film_of(FieldReader({"size": size}, "film"))
         self._change(film=dataclasses.replace(self.edit.film, size=size))
 
     def scene_time(self, at: float) -> float:

@@ -11,7 +11,7 @@ import torch
 
 from helpers.edit_scenes import bar_scene, dress
 from helpers.edit_scripts import SCRIPT, changed
-from scgs_warp.edit import Edit, EditSession, Film
+from scgs_warp.edit import Edit, EditSession, Target
 from scgs_warp.edit.edit_file import parse, read
 from scgs_warp.edit.rotations import angle, from_axis
 from scgs_warp.errors import UserError
@@ -170,8 +170,8 @@ def test_what_is_saved_can_be_loaded(tmp_path):
         with pytest.raises(UserError, match=words):
             make()
         assert own.edit == before
-    own.apply(Edit(film=Film(fps=1e6)))
-    with pytest.raises(UserError, match="fps"):
+    own.apply(Edit(targets={"nobody": Target()}))
+    with pytest.raises(UserError, match="nobody"):
         own.save(tmp_path / "edit.json")
     assert list(tmp_path.iterdir()) == []
 

@@ -58,9 +58,9 @@ def test_a_broken_number_changes_nothing(model, broken):
     model.grab(STAY)
     model.drag(Target((0.1, 0.0, 0.0)))
     before = model.session.edit
-    with pytest.raises(UserError, match="finite"):
+    with pytest.raises(UserError, match="translation"):
         GizmoFrame(np.zeros(3), np.array([1.0, 0, 0, 0])).target(np.array([broken, 0, 0]), np.array([1.0, 0, 0, 0]))
-    with pytest.raises(UserError, match="finite"):
+    with pytest.raises(UserError, match="translation"):
         model.drag(Target((broken, 0.0, 0.0)))
     assert model.session.edit is before and model.dragging
 
@@ -162,10 +162,10 @@ def test_handles_are_changed_reset_and_removed(model):
 @pytest.mark.parametrize(
     ("fields", "words"),
     [
-        ({"film": Film(seconds=math.nan)}, "film"),
-        ({"film": Film(fps=0.0)}, "film.fps"),
-        ({"film": Film(size=10**9)}, "film.size"),
-        ({"playback": Playback(repeat="never")}, "playback.repeat"),
+        ({"film": 3}, "film"),
+        ({"pins": [10**6]}, "pins"),
+        ({"targets": {"nobody": Target()}}, "targets.nobody"),
+        ({"skin": "fur"}, "skin"),
     ],
 )
 def test_what_a_page_sends_is_checked(model, fields, words):
@@ -228,7 +228,7 @@ def test_what_was_not_moved_has_not_been_in_hand(model):
     model.release()
     assert model.session.edit is before and model.active is None and model.selection and not model.undo()
     model.grab(STAY)
-    with pytest.raises(UserError, match="finite"):
+    with pytest.raises(UserError, match="translation"):
         model.drag(Target((math.nan, 0.0, 0.0)))
     model.release()
     assert model.session.edit is before and not model.undo()
