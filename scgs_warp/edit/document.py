@@ -214,6 +214,17 @@ class Edit:
         """Largest distance from a handle's time, in scene time, at which a one-frame edit still shows."""
         return frame_reach(self.film, self.playback)
 
+    @property
+    def after_film(self) -> str | None:
+        """Line on the keyframes and views of the camera that lie after the film's end; None if there are none."""
+        shot, end = self.film.shot, self.film.seconds
+        late = {"keyframes": [frame.at for frame in self.keyframes if frame.at > end]}
+        late["views of the camera"] = [view.at for view in shot.views[1:] if view.at > end and shot.kind == "orbit"]
+        found = [f"{name} up to {times[-1]:g} s" for name, times in late.items() if times]
+        if not found:
+            return None
+        return f"the film ends at {end:g} s, before {' and '.join(found)}; make film.seconds larger, or move them"
+
     def turned(self, name: str) -> bool:
         """Return whether any target or keyframe turns the handle of that name."""
         places = [self.targets, *(frame.targets for frame in self.keyframes)]

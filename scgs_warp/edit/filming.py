@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import math
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,7 @@ from ..geometry import cameras
 from ..types import Camera
 from ..visualization.figures import to_bytes
 from ..visualization.video import film, require_memory
-from .document import Film, View
+from .document import Edit, Film, View
 from .keyframes import cubic
 from .session import EditSession
 
@@ -79,6 +80,12 @@ def film_frame(session: EditSession, at: float, size: int | None = None) -> np.n
     return to_bytes(session.render(camera, session.scene_time(at), at, background).rgb)
 
 
+def note_what_is_late(edit: Edit) -> None:
+    """Name keyframes and views of the camera that lie after the film's end, in a line on standard error."""
+    if edit.after_film is not None:
+        print(f"note: {edit.after_film}", file=sys.stderr)
+
+
 def _at_once(draw: Callable[[], np.ndarray]) -> np.ndarray:
     return draw()
 
@@ -89,7 +96,8 @@ def render_film(
     advance: Callable[[], None] | None = None,
     compute: Callable[[Callable[[], np.ndarray]], np.ndarray] = _at_once,
 ) -> int:
-    """Write the session's film, whose frames are those that the editor shows.
+    """Write the session's film, whose frames are those that the editor shows. A line on standard error names keyframes
+    and views of the camera that lie after the film's end.
 
     Args:
         output: name that ends in .mp4 or .gif, or a folder for numbered PNGs.
@@ -103,6 +111,7 @@ def render_film(
         UserError: the output cannot be written, or the film does not fit into memory.
     """
     settings = session.edit.film
+    note_what_is_late(session.edit)
     first = film_camera(session, 0.0)
     require_memory(output, first.width, first.height, settings.frames, str(session.scene.device))
     with film(output, settings.fps) as writer:

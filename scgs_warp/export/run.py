@@ -14,6 +14,7 @@ import torch
 from .. import data
 from ..config.fields import IMAGE_SETTINGS
 from ..edit import EditSession, edit_file
+from ..edit.filming import note_what_is_late
 from ..edit.skeleton import Skeleton as Parts
 from ..errors import UserError
 from ..formats.gaussian_files import read_antialiased, read_gaussians, shortage_as_user_error, write_gaussians
@@ -98,6 +99,8 @@ def _open_session(request: ExportRequest, scene: Scene) -> EditSession:
     session = EditSession(scene)
     if request.edit is not None:
         session.load(request.edit)
+        if not request.still and request.at is None:
+            note_what_is_late(session.edit)
     return session
 
 

@@ -49,3 +49,24 @@ def test_cameras(session):
     own.apply(parse(changed("film.shot", shot), "x", own.engine))
     camera = film_camera(own, 0.0)
     assert float((camera.position - torch.tensor([1.0, 2.0, 3.0])).norm()) == pytest.approx(7, rel=1e-5)
+
+
+LATE = [{"at": 0, "azimuth": 10}, {"at": 2, "azimuth": 70}]
+
+
+@pytest.mark.parametrize(
+    ("path", "value", "said"),
+    [
+        ("keyframes.1.at", 0.5, ""),
+        ("keyframes.1.at", 1.5, "the film ends at 0.5 s, before keyframes up to 1.5 s; "),
+        ("film.shot.views.1.at", 2, "the film ends at 0.5 s, before views of the camera up to 2 s; "),
+        ("film.shot", {"kind": "fixed", "views": LATE}, ""),
+        ("film.shot.views", LATE[1:], ""),
+        ("film.seconds", 0.25, "before keyframes up to 0.5 s and views of the camera up to 0.5 s; "),
+    ],
+)
+def test_what_lies_after_the_end_is_named(session, tmp_path, capsys, path, value, said):
+    own = EditSession(session.scene, parse(changed(path, value), "edit.json", session.engine))
+    render_film(own, tmp_path / "film")
+    found = capsys.readouterr().err
+    assert (said in found and found.startswith("note: ") and found.count("\n") == 1) if said else not found
