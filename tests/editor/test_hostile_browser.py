@@ -8,6 +8,7 @@ import json
 import numpy as np
 import pytest
 
+from helpers.chromium import lose_context, restore_context
 from helpers.edit_scenes import bar_scene
 from helpers.editor_windows import Window, serve, until
 from scgs_warp.edit import EditSession, edit_file
@@ -181,4 +182,23 @@ def test_a_key_follows_the_arrows_and_escape_leaves_it(browser, editor):
     window.still()
     assert editor.session.edit == edit and keys.nth(1).bounding_box() == box
     assert window.ask("studio.link.state.selection.length") == 2
+    window.close()
+
+
+def test_the_scene_is_drawn_again_when_the_graphics_driver_comes_back(browser, editor):
+    window = Window(browser, editor)
+    window.still()
+    view, alert = window.page.locator("#view"), window.page.get_by_role("alert")
+    before = view.screenshot()
+    lose_context(window.page)
+    assert "reload the page" in alert.inner_text()
+    window.page.mouse.move(400, 300)
+    window.ask("studio.picture()")
+    assert "reload the page" in window.page.locator("#notes").inner_text()
+    restore_context(window.page)
+    window.page.mouse.move(5, 5)
+    until(alert.is_hidden)
+    until(lambda: window.page.locator("#notes li").count() == 0)
+    window.still()
+    assert view.screenshot() == before
     window.close()

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from helpers.chromium import chromium
+from helpers.chromium import chromium, lose_context, restore_context
 from helpers.edit_scenes import bar_scene, rich_scene, tinted_scene
 from scgs_warp.export.page import write_page
 from scgs_warp.export.request import ExportRequest
@@ -346,15 +346,13 @@ def test_the_picture_survives_other_sizes_and_a_lost_device(browser, bar):
     visit.page.set_viewport_size(SIZE)
     until(lambda: visit.state()["size"] == [640, 520])
     assert np.array_equal(visit.screen(), begin)
-    visit.page.evaluate(
-        """() => window.scgs.ready.then(({ player }) => new Promise((done) => {
-          const lose = player.gl.getExtension("WEBGL_lose_context");
-          player.canvas.addEventListener("webglcontextrestored", () => done());
-          player.canvas.addEventListener("webglcontextlost", () => setTimeout(() => lose.restoreContext(), 50));
-          lose.loseContext();
-        }))"""
-    )
-    assert np.array_equal(visit.screen(), begin)
+    lose_context(visit.page)
+    assert "reload the page" in visit.page.get_by_role("alert").inner_text()
+    visit.page.mouse.move(320, 200)
+    with pytest.raises(Exception, match="reload the page"):
+        visit.render(orbit_camera(bar[0].overview, 0.0, 32), 0.0)
+    restore_context(visit.page)
+    assert np.array_equal(visit.screen(), begin) and visit.page.get_by_role("alert").is_hidden()
     assert not visit.problems
     visit.context.close()
 

@@ -43,3 +43,23 @@ def chromium() -> Iterator[Any]:
             yield browser
         finally:
             browser.close()
+
+
+def lose_context(page: Any) -> None:
+    """Take the graphics device from a page that shows a scene, as drivers do, and wait until the page knows."""
+    _change_context(page, "lost", "loseContext")
+
+
+def restore_context(page: Any) -> None:
+    _change_context(page, "restored", "restoreContext")
+
+
+def _change_context(page: Any, event: str, call: str) -> None:
+    page.evaluate(
+        """([event, call]) => window.scgs.ready.then(({ player }) => new Promise((done) => {
+          window.lose ??= player.gl.getExtension("WEBGL_lose_context");
+          player.canvas.addEventListener(`webglcontext${event}`, () => done(), { once: true });
+          window.lose[call]();
+        }))""",
+        [event, call],
+    )

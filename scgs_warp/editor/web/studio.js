@@ -141,7 +141,7 @@ class Studio {
       requestAnimationFrame(loop);
     };
     requestAnimationFrame(loop);
-    say("");
+    if (player.renderer !== null) say("");
     return { player, clock, studio: this };
   }
 
@@ -303,6 +303,7 @@ class Studio {
   picture() {
     const { player } = this, { canvas } = player;
     if (!player.renderAt) return this.download(canvas);
+    if (!player.renderer) return this.note(LOST);
     const view = player.orbit.camera(canvas.width, canvas.height);
     const { width, height, pixels } = player.renderAt(player.time, view.viewmat, view.K, view.width, view.height);
     const drawn = Object.assign(document.createElement("canvas"), { width, height });

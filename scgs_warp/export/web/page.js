@@ -55,7 +55,7 @@ async function startPage(load, extend = () => ({})) {
   };
   requestAnimationFrame(loop);
   clock.play(!asked.has("paused") && !matchMedia("(prefers-reduced-motion: reduce)").matches);
-  say("");
+  if (player.renderer) say("");
   const poster = element("poster");
   if (poster) {
     poster.classList.add("gone");

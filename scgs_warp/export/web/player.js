@@ -4,6 +4,7 @@ const SECONDS = 4; // a scene's whole time at speed 1, unless its facts say othe
 const SLOW = 50; // milliseconds a frame: slower machines draw fewer pixels while something moves ...
 const COARSEST = 0.4; // ... but not fewer than so many of each side's
 const REST = 250; // milliseconds of stillness after which a frame is drawn in full
+const LOST = "The graphics driver has dropped the picture; it comes back by itself as a rule. If not, reload the page.";
 const BREAK = 3000; // milliseconds of rest between two movements
 
 class Player {
@@ -26,11 +27,9 @@ class Player {
     canvas.addEventListener("webglcontextlost", (event) => {
       event.preventDefault(); // else it never comes back
       this.renderer = null;
+      say(LOST);
     });
-    canvas.addEventListener("webglcontextrestored", () => {
-      this.renderer = new Renderer(this.gl, this.model);
-      this.takeOrder(this.order, this.amount);
-    });
+    canvas.addEventListener("webglcontextrestored", () => this.drawAgain());
     new ResizeObserver(() => this.resize()).observe(canvas);
     this.resize();
   }
@@ -48,6 +47,17 @@ class Player {
     this.startSorter();
     this.renderer?.dispose();
     this.renderer = this.gl.isContextLost() ? null : new Renderer(this.gl, model);
+  }
+
+  drawAgain() {
+    try {
+      this.renderer = new Renderer(this.gl, this.model);
+    } catch (error) {
+      say(error.message);
+      return;
+    }
+    this.takeOrder(this.order, this.amount);
+    say("");
   }
 
   get seconds() {
@@ -182,6 +192,7 @@ class Player {
 
   // An exact frame in memory, sorted for this very view; what is on the screen stays.
   renderAt(time, viewmat, K, width, height, background) {
+    if (!this.renderer) throw new Error(LOST);
     const view = normalised({ viewmat, K, width, height }, this.model.facts.normalisation);
     const table = this.pose(time, new Float32Array(this.table.length), true);
     const order = new Uint32Array(this.model.count);
