@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
+import re
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from itertools import pairwise
@@ -249,6 +250,21 @@ class Edit:
         handles = tuple(dataclasses.replace(h, name=new) if h.name == old else h for h in self.handles)
         frames = tuple(dataclasses.replace(frame, targets=named(frame.targets)) for frame in self.keyframes)
         return dataclasses.replace(self, handles=handles, targets=named(self.targets), keyframes=frames)
+
+    def named_after(self, part: str, name: str) -> Edit:
+        """Return the edit in which the handles of ``part`` that are called ``name`` or ``name (2)`` are called after
+        the part."""
+        edit = self
+        for handle in sorted(self.handles, key=lambda handle: (len(handle.name), handle.name)):
+            if handle.part == part != name and re.fullmatch(re.escape(name) + r"( \(\d+\))?", handle.name):
+                edit = edit.with_name(handle.name, edit.free_name(part))
+        return edit
+
+    def free_name(self, part: str) -> str:
+        """Return a name for another handle of a part: the part's own, or the first free one with a number."""
+        taken = {handle.name for handle in self.handles}
+        names = [part, *(f"{part} ({i})" for i in range(2, len(taken) + 3))]
+        return next(name for name in names if name not in taken)
 
     def handle(self, name: str) -> Handle | None:
         return next((handle for handle in self.handles if handle.name == name), None)

@@ -156,7 +156,8 @@ class FieldReader:
             return default
         fits = isinstance(value, list | tuple) and len(value) == size and all(map(_is_number, value))
         if not fits or not all(low <= x <= high for x in value):
-            raise self.wrong(name, f"is {show_value(value)}", f"give {size} numbers from {low:g} to {high:g}")
+            which = f"{size} finite numbers" if high == math.inf else f"{size} numbers from {low:g} to {high:g}"
+            raise self.wrong(name, f"is {show_value(value)}", f"give {which}")
         return tuple(float(x) for x in value)
 
     def direction(self, name: str) -> Any:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
-from sys import float_info
 from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
@@ -72,7 +71,7 @@ class Target:
 def _target_fields(node: FieldReader) -> dict[str, Any]:
     return {
         "translation": node.vector("translation", 3, (0.0, 0.0, 0.0)),
-        "rotation": node.vector("rotation", 4, (1.0, 0.0, 0.0, 0.0), -float_info.max, float_info.max),
+        "rotation": node.vector("rotation", 4, (1.0, 0.0, 0.0, 0.0), -math.inf, math.inf),
     }
 
 

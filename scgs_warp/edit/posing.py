@@ -101,7 +101,7 @@ class Posing:
         return path
 
     def rename_part(self, old: str, new: str) -> None:
-        """Rename a part, also in the handles that pose it."""
+        """Rename a part, also in the handles that pose it and are called after it."""
         self._restructure(self.skeleton.renamed(old, new), {old: new})
 
     def merge_parts(self, first: str, second: str) -> None:
@@ -134,7 +134,10 @@ class Posing:
                     continue
                 handle = dataclasses.replace(handle, part=part, nodes=skeleton.part(part).nodes)
             handles.append(handle)
-        self.apply(dataclasses.replace(edit, handles=tuple(handles)))
+        edit = dataclasses.replace(edit, handles=tuple(handles))
+        for old, new in renamed.items():
+            edit = edit if new is None else edit.named_after(new, old)
+        self.apply(edit)
 
     # Posing
 
@@ -385,9 +388,7 @@ def _with_handle(edit: Edit, skeleton: Skeleton, part: str, time: float) -> tupl
     acting = [edit.handles[row] for row in own if edit.handles[row].strength(time, edit.reach) > 0.0]
     if acting:
         return edit, acting[-1]  # which counts
-    taken = {handle.name for handle in edit.handles}
-    names = [part, *(f"{part} ({i})" for i in range(2, len(taken) + 3))]
-    handle = Handle(next(name for name in names if name not in taken), nodes, float(time), part=part)
+    handle = Handle(edit.free_name(part), nodes, float(time), part=part)
     row = own[0] if own else len(edit.handles)  # those of other moments count more
     handles = (*edit.handles[:row], handle, *edit.handles[row:])
     return dataclasses.replace(edit, handles=handles, skeleton=skeleton), handle

@@ -25,8 +25,12 @@ def parts_message(session: EditSession) -> dict[str, Any]:
 
 
 def rename_part(editor: Host, fields: FieldReader) -> None:
-    with editor.model.changing() as session:
+    model = editor.model
+    with model.changing() as session:
+        names = [handle.name for handle in session.edit.handles]
         session.rename_part(short_text(fields, "name"), _new_name(fields))
+        if model.active is not None:  # its handle may be called after the part
+            model.active = session.edit.handles[names.index(model.active)].name
 
 
 def rename_handle(editor: Host, fields: FieldReader) -> None:

@@ -250,7 +250,7 @@ def _write_frames(
 def _write_skeleton(request: ExportRequest, session: EditSession, moments: list[AnimationMoment]) -> str:
     scene, up = session.scene, session.scene.overview.up
     with progress(len(moments), "export") as shown:
-        skeleton = build_skeleton(session, moments, shown.advance)
+        skeleton = build_skeleton(session, moments, shown.advance, bound=request.kind != "graph")
     length = f"{len(skeleton.rest)} control points at {len(moments)} instants"
     if request.kind == "graph":
         write_graph(request.output, skeleton, session.graph.edges, up)

@@ -136,23 +136,28 @@ def extent_of(points: np.ndarray) -> float:
 
 @torch.no_grad()
 def build_skeleton(
-    session: EditSession, moments: list[AnimationMoment], advance: Callable[[], None] | None = None
+    session: EditSession,
+    moments: list[AnimationMoment],
+    advance: Callable[[], None] | None = None,
+    *,
+    bound: bool = True,
 ) -> Skeleton:
     """Build the skeleton of a session's control points under its edit.
 
     Args:
         moments: moments of the animation.
         advance: called after each moment.
+        bound: whether Gaussians are to follow. A mask, by which they follow less, does not concern the control points.
 
     Raises:
-        UserError: the motion is not finite, memory does not suffice, or the scene has a mask and an edit: masked
-            Gaussians do not follow edited control points by skinning alone.
+        UserError: the motion is not finite, memory does not suffice, or Gaussians are to follow an edit in a scene with
+            a mask: they do not follow edited control points by skinning alone.
     """
     engine, scene = session.engine, session.scene
     count, length = len(engine.rig.positions), len(moments)
     what = f"the motion of {count:,} control points at {length:,} instants"
     memory.require(JOINT_BYTES * count * length, "cpu", what, "give fewer --frames, or a shorter film")
-    masked = bool(scene.config.motion.mask) and engine.rig.moves
+    masked = bound and bool(scene.config.motion.mask) and engine.rig.moves
     poses, own = [], []
     for moment in moments:
         pose, motion = _pose(session, moment, masked)
@@ -215,7 +220,7 @@ def _pose(session: EditSession, moment: AnimationMoment, masked: bool) -> tuple[
         return motion.pose, None
     if masked:
         raise UserError(
-            "--edit: this scene's motion has a mask (motion.mask); write a film, ply-sequence, 4dgs or tracks"
+            "--edit: this scene's motion has a mask (motion.mask); write a film, ply-sequence, 4dgs, tracks or graph"
         )
     return compose(motion, bent), own_pose(motion, bent)
 

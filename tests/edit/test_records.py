@@ -45,7 +45,7 @@ from scgs_warp.errors import UserError
         (View, {"distance": 0.0}, "view: distance is 0.0; give a number"),
         (View, {"target": (0.0, math.nan, 0.0)}, "view: target is .*; give 3 numbers"),
         (Target, {"translation": "up"}, 'target: translation is "up"; give 3 numbers'),
-        (Target, {"rotation": (1.0, 0.0, 0.0)}, "target: rotation is .*; give 4 numbers"),
+        (Target, {"rotation": (1.0, 0.0, 0.0)}, "target: rotation is .*; give 4 finite numbers"),
         (Handle, {"name": "a", "nodes": []}, "handle 'a': nodes is missing or empty; list control points"),
         (Handle, {"name": "a", "nodes": [-1]}, "handle 'a': nodes names control point -1"),
         (

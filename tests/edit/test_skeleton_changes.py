@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -34,6 +36,35 @@ def test_the_skeleton_is_changed_and_undone(session):
     for _ in range(6):
         assert session.undo()
     assert session.skeleton.names == names
+
+
+def test_handles_that_are_called_after_a_part_are_renamed_with_it(session):
+    def names() -> set[str]:
+        return {handle.name for handle in session.edit.handles}
+
+    session.turn("elbow_left", 30, (1, 0, 0), 0.25)
+    frame = dataclasses.replace(session.edit.handles[0], lasts="frame")
+    session.apply(dataclasses.replace(session.edit, handles=(frame,)))
+    session.add_keyframe(1.0)
+    session.turn("elbow_left", 20, (1, 0, 0), 0.75)
+    session.add_handle(session.skeleton.part("head").nodes[:1], 0.0, "forearm (2)")
+    before = session.node_positions(0.25)
+    assert names() == {"elbow_left", "elbow_left (2)", "forearm (2)"}
+    session.rename_part("elbow_left", "forearm")
+    assert names() == {"forearm", "forearm (3)", "forearm (2)"}
+    assert set(session.edit.targets) == {"forearm", "forearm (3)"}
+    assert set(session.edit.keyframes[0].targets) == {"forearm"}
+    np.testing.assert_array_equal(session.node_positions(0.25), before)
+    session.rename_handle("forearm", "my handle")
+    session.rename_part("forearm", "lower arm")
+    assert names() == {"my handle", "lower arm", "forearm (2)"}, "names that somebody gave stay"
+
+
+def test_a_handle_of_merged_parts_is_called_after_the_whole(session):
+    session.turn("shoulder_left", 20, (0, -1, 0))
+    session.merge_parts(*ARM[::-1])
+    assert [(handle.name, handle.part) for handle in session.edit.handles] == [("elbow_left", "elbow_left")]
+    assert set(session.edit.targets) == {"elbow_left"}
 
 
 @pytest.mark.parametrize("order", [ARM, ARM[::-1]])

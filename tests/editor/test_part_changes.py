@@ -47,6 +47,7 @@ def test_a_part_is_renamed_undone_and_kept(editor, page, tmp_path):
     assert "problem" not in page.ask("rename_part", name=first, to="  left half ")
     assert names_of(page) == ["left half", *others] and page.state["part"] == "left half"
     assert page.state["selection"] == nodes and page.state["handles"][0]["part"] == "left half"
+    assert page.state["handles"][0]["name"] == page.state["active"] == "left half"
     assert editor.autosave is not None and editor.autosave.flush()
     kept = edit_file.read(tmp_path / "autosave.json", editor.session.engine)
     assert kept == editor.session.edit and kept.skeleton is not None and "left half" in kept.skeleton.names

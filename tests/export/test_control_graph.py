@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from helpers.edit_scenes import bar_scene
+from helpers.edit_sessions import TURN, part
 from helpers.export_files import gltf_arrays
 from scgs_warp.edit import EditSession
 from scgs_warp.export.control_graph import write_graph
@@ -27,3 +29,17 @@ def test_every_control_point_is_an_octahedron_and_every_edge_a_bar(tmp_path):
     np.testing.assert_array_equal(arrays["JOINTS_0"][:, 0], [*np.repeat(np.arange(nodes), 6), *np.repeat(edges, 3)])
     np.testing.assert_array_equal(arrays["WEIGHTS_0"], np.eye(4)[:1].repeat(len(arrays["POSITION"]), 0))
     np.testing.assert_allclose(np.linalg.norm(arrays["NORMAL"], axis=1), 1.0, atol=1e-5)
+
+
+@pytest.mark.parametrize("edited", [False, True])
+def test_a_mask_of_gaussians_does_not_concern_the_graph(edited):
+    masked, plain = (EditSession(bar_scene(share=share)) for share in (0.5, None))
+    for session in (masked, plain) if edited else ():
+        session.add_handle(part(session, 0.8, 1.0), 0.0, "end")
+        session.move("end", [0, 0, 0.3], TURN)
+    moments = even_moments(3, 2.0)
+    skeleton = build_skeleton(masked, moments, bound=False)
+    np.testing.assert_array_equal(skeleton.positions, build_skeleton(plain, moments).positions)
+    assert len(skeleton.rest) == len(masked)
+    for row, moment in enumerate(moments):
+        np.testing.assert_allclose(skeleton.positions[row], masked.node_positions(moment.time), atol=1e-5)

@@ -140,6 +140,15 @@ def test_tracks_and_segments_of_a_run(run, tmp_path, capsys):
         np.testing.assert_array_equal(found["points"][2], truth[found["gaussians"]])
 
 
+def test_the_graph_of_an_edit_is_written_with_a_mask_and_its_gaussians_are_refused(masked_run, tmp_path, capsys):
+    bent(Scene.load(masked_run)).save(tmp_path / "edit.json")
+    how = ["--run", masked_run, "--edit", tmp_path / "edit.json", "--output", tmp_path / "a.glb"]
+    export(*how, "--format", "graph")
+    assert "24 control points at 120 instants" in capsys.readouterr().out
+    assert app.cli([str(argument) for argument in how]) == 2
+    assert "write a film, ply-sequence, 4dgs, tracks or graph" in capsys.readouterr().err
+
+
 def test_graph_is_valid(run, tmp_path):
     export("--run", run, "--format", "graph", "--output", tmp_path / "g.glb", "--frames", 4)
     assert gltf_errors(tmp_path / "g.glb") == []
