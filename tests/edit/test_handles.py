@@ -111,5 +111,5 @@ def test_a_handle_holds_plain_numbers():
 
 @pytest.mark.parametrize("numbers", [((0.0, 0.0, float("nan")),), ((0.0, 0.0, 0.0), (float("inf"), 0.0, 0.0, 0.0))])
 def test_a_target_that_is_not_finite_is_refused(numbers):
-    with pytest.raises(UserError, match="give 3 numbers from|give 4 finite numbers"):
+    with pytest.raises(UserError, match=r"give 3 numbers from|give 4 finite numbers"):
         Target(*numbers)
