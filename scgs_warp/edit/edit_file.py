@@ -206,7 +206,8 @@ def _region(region: FieldReader, engine: Engine, time: float) -> tuple[int, ...]
         low, high = corners.vector("low", 3), corners.vector("high", 3)
         if low is None or high is None:
             raise region.wrong("box", "lacks a corner", "give two corners of 3 numbers")
-        chosen = np.flatnonzero(((points >= np.array(low)) & (points <= np.array(high))).all(axis=1)).tolist()
+        low, high = np.sort([low, high], axis=0)  # any two opposite corners
+        chosen = np.flatnonzero(((points >= low) & (points <= high)).all(axis=1)).tolist()
     else:
         raise region.wrong("", "names no place", "give point, sphere with radius, or box with two corners")
     if not chosen:

@@ -54,9 +54,9 @@ def export_fourdgs(
         UserError: there are fewer than two moments, no Gaussian is finite, or memory or the format do not suffice.
     """
     if len(moments) < 2:
-        raise UserError("--format 4dgs: needs at least two moments; give --frames 2 or more")
+        raise UserError("--format 4dgs: needs at least two moments; give --frames 2 or more, or a longer film")
     need = COURSE_BYTES * len(moments) * int(usable.sum())
-    memory.require(need, "cpu", f"--format 4dgs of {len(moments)} frames", "give fewer --frames")
+    memory.require(need, "cpu", f"--format 4dgs of {len(moments)} frames", "give fewer --frames, or a shorter film")
     with progress(2 * len(moments) - 1, "export") as shown:
         frames, harmonics, rows = [], [], usable.copy()
         for number, moment in enumerate(moments):

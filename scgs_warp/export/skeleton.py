@@ -85,7 +85,9 @@ def even_moments(frames: int, fps: float) -> list[AnimationMoment]:
 def film_moments(session: EditSession) -> list[AnimationMoment]:
     """Return the moments of all frames of an edit's film."""
     film = session.edit.film
-    return [AnimationMoment(i / film.fps, session.scene_time(i / film.fps), i / film.fps) for i in range(film.frames)]
+    seconds = np.arange(film.frames) / film.fps
+    times = session.edit.playback.times_at(seconds, film.seconds)
+    return [AnimationMoment(at, time, at) for at, time in zip(seconds.tolist(), times.tolist())]
 
 
 def posed_gaussians(scene: Scene, session: EditSession | None, moment: AnimationMoment) -> Gaussians:
@@ -220,7 +222,8 @@ def _pose(session: EditSession, moment: AnimationMoment, masked: bool) -> tuple[
         return motion.pose, None
     if masked:
         raise UserError(
-            "--edit: this scene's motion has a mask (motion.mask); write a film, ply-sequence, 4dgs, tracks or graph"
+            "--edit: with this run's mask (motion.mask), Gaussians follow handles whole but the motion by a share, "
+            "which control points cannot hold; write a film, ply-sequence, 4dgs, tracks or graph"
         )
     return compose(motion, bent), own_pose(motion, bent)
 

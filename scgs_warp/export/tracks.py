@@ -125,7 +125,7 @@ def build_tracks(
         surface = surface[np.sort(farthest_points(start.means[surface].cpu(), chosen).numpy())]
     count, length = len(surface), len(moments)
     need = POINT_BYTES[suffix] * count * length + (WEIGHT_BYTES * length**2 if suffix == ".glb" else 0)
-    fewer = "give fewer --frames or --points"
+    fewer = "give fewer --frames or --points, or a shorter film"
     memory.require(need, "cpu", f"--format tracks of {count:,} points at {length:,} instants", fewer)
     frames, colors = [], None
     for moment in moments:

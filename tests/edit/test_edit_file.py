@@ -230,6 +230,14 @@ def test_a_region_of_several_kinds_is_refused(session, region, words):
         parse(changed("handles.0.nodes", region), "x.json", session.engine)
 
 
+def test_a_box_may_be_given_by_any_two_opposite_corners(session):
+    boxes = [[-1, -2, -1], [0, 2, 1]], [[0, 2, 1], [-1, -2, -1]], [[0, -2, 1], [-1, 2, -1]]
+    found = [
+        parse(changed("handles.0.nodes", {"box": box}), "x.json", session.engine).handles[0].nodes for box in boxes
+    ]
+    assert found[0] == found[1] == found[2] and found[0]
+
+
 @pytest.mark.parametrize("nodes", [0, "", False, {}])
 def test_exaggeration_of_no_list_of_control_points_is_refused(session, nodes):
     with pytest.raises(UserError, match=r"exaggerate\.nodes"):

@@ -45,7 +45,7 @@ def test_what_cannot_be_shown_on_one_line_is_no_name(name):
 
 
 def test_objects_are_strict_json():
-    assert parse_object('{"a": 1}', "a.json") == {"a": 1}
+    assert parse_object('{"a": 1}', "a.json") == parse_object('\ufeff{"a": 1}', "a.json") == {"a": 1}
     for text in ("[1]", '{"a": Infinity}', '{"a": 1, "a": 2}', "{"):
         with pytest.raises(UserError, match=r"a\.json"):
             parse_object(text, "a.json")
