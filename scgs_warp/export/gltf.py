@@ -95,9 +95,8 @@ class GltfDocument:
         text += b" " * (-len(text) % 4)
         total = 12 + 8 + len(text) + 8 + self._size
         if total > MAX_BYTES:
-            raise UserError(
-                f"the .glb would have {total / 2**30:.1f} GiB; the format ends at 4: give fewer --frames, or a shorter film"
-            )
+            size = f"the .glb would have {total / 2**30:.1f} GiB; the format ends at 4"
+            raise UserError(f"{size}: give fewer --frames, or a shorter film")
         head = struct.pack("<4sIIII", b"glTF", 2, total, len(text), 0x4E4F534A)
         return b"".join([head, text, struct.pack("<II", self._size, 0x004E4942), *self._parts])
 
