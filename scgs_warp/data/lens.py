@@ -79,6 +79,14 @@ def make_lens(model: str, params: tuple[float, ...], skew: float = 0.0) -> Lens:
     return Lens(fx, fy, cx, cy, model, params, skew)
 
 
+def rescaled(lens: Lens, size: tuple[int, int], new: tuple[int, int]) -> Lens:
+    """Return the lens of a COLMAP model, of images of one (width, height), for the same images at a new one."""
+    camera = import_pycolmap().Camera(model=lens.model, width=size[0], height=size[1])
+    camera.params = list(lens.params)
+    camera.rescale(*new)
+    return make_lens(lens.model, tuple(camera.params))
+
+
 def project(lens: Lens, rays: np.ndarray) -> np.ndarray:
     """Project camera rays [N, 3] (x right, y down, z forward) to pixels [N, 2] of the file; NaN where the model is
     undefined."""

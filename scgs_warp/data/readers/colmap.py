@@ -1,4 +1,8 @@
-"""Reader of COLMAP's layout: a sparse model in ``sparse/0``, ``sparse`` or ``colmap/sparse/0``, and ``images/``."""
+"""Reader of COLMAP's layout: a sparse model in ``sparse/0``, ``sparse`` or ``colmap/sparse/0``, and ``images/``.
+
+Images may be smaller than the model's cameras state: in a folder of reduced images (``images_2``, ``images_4``), or all
+of them. The cameras are then scaled to them.
+"""
 
 from __future__ import annotations
 
@@ -7,21 +11,22 @@ from functools import partial
 from pathlib import Path, PurePosixPath
 
 from ...errors import UserError
-from ...storage.safe_paths import inside
 from ..assemble import FrameRecord, assemble, video_border, with_points
 from ..choice import choose
 from ..dataset import Dataset
 from ..far_origin import moved, note, offset_of
 from ..held_out import held_out
 from ..images import ReadOptions, header_sizes, size_text
-from ..lens import Lens, make_lens
+from ..lens import Lens, make_lens, rescaled
 from ..name_times import times_from_names
 from ..natural_order import natural
+from .colmap_images import ImageFiles, find_images
 from .colmap_model import ModelCamera, ModelImage, find_model, read_model
-from .transforms import in_any_case
 
 MADE_FROM = "give the images that the model was made from, with their names"
 """What to do about missing images."""
+LEAST_REDUCTION, MAX_ASPECT_ERROR = 1.5, 0.01
+"""How many times smaller reduced images are at least, and the largest relative error of their proportions."""
 
 
 def recognises(folder: Path) -> bool:
@@ -43,12 +48,15 @@ def read(folder: Path, split: str, options: ReadOptions) -> Dataset:
     assert model_folder is not None, "recognises(folder)"
     model = read_model(model_folder)
     images = sorted(model.images, key=lambda image: natural(image.name))
-    base = _image_folder(folder, model_folder)
-    files = [_file(base, image, model_folder) for image in images]
+    found = find_images(folder, model_folder, [image.name for image in images])
+    files = found.files
     lenses = [partial(_lens, model_folder, image, model.cameras[image.camera]) for image in images]
     times = times_from_names([image.name for image in images])
     choice = choose(model_folder, files, times, options, _cameras(images), MADE_FROM)
-    _check_sizes([files[index] for index in choice.indices], [lenses[index] for index in choice.indices])
+    sizes = _check_sizes([files[index] for index in choice.indices], [lenses[index] for index in choice.indices])
+    stated = [model.cameras[images[index].camera] for index in choice.indices]
+    ratio, smaller = _reduction(found, sizes, [(camera.width, camera.height) for camera in stated])
+    options = options._replace(downscale=max(1.0, options.downscale / ratio))
     chosen = held_out(model_folder, choice.indices, split)
     offset = offset_of([image.viewmat for image in images])
     records = [
@@ -62,20 +70,10 @@ def read(folder: Path, split: str, options: ReadOptions) -> Dataset:
         for index in chosen
     ]
     border = video_border([files[index] for index in choice.indices], [times[index] for index in choice.indices])
-    notes = [*choice.notes, *([] if offset is None else [note(offset)])]
+    notes = [*choice.notes, *found.notes, *smaller, *([] if offset is None else [note(offset)])]
     data = assemble(records, options, folder=folder, split=split, border=border, notes=notes)
     points = model.points if offset is None else model.points - offset
     return with_points(data, points, model.colors) if len(points) else data
-
-
-def _image_folder(folder: Path, model_folder: Path) -> Path:
-    tried = [folder / "images", model_folder / "images", folder / "input", folder]
-    return next((base for base in tried[:-1] if base.is_dir()), tried[-1])
-
-
-def _file(base: Path, image: ModelImage, model_folder: Path) -> Path:
-    file = inside(base, image.name, f"{model_folder}: the name of an image", "image")
-    return in_any_case(file) or file
 
 
 def _cameras(images: list[ModelImage]) -> list[str]:
@@ -84,13 +82,16 @@ def _cameras(images: list[ModelImage]) -> list[str]:
     return folders if any(folder != "." for folder in folders) else [str(image.camera) for image in images]
 
 
-def _check_sizes(files: list[Path], lenses: list[Callable[[tuple[int, int]], Lens]]) -> None:
+def _check_sizes(files: list[Path], lenses: list[Callable[[tuple[int, int]], Lens]]) -> list[tuple[int, int] | None]:
     """Check the presence and the sizes of the files of all splits before any is decoded, so that a model of other
-    images is refused at once."""
+    images is refused at once. Return the size of each image as its camera sees it, None where it is unreadable."""
+    found: list[tuple[int, int] | None] = []
     for file, lens in zip(files, lenses):
         sizes = header_sizes(file)
-        if sizes and not any(_fits(lens, size) for size in sizes):
+        found.append(next((size for size in sizes if _fits(lens, size)), None))
+        if sizes and found[-1] is None:
             lens(sizes[0])  # raises
+    return found
 
 
 def _fits(lens: Callable[[tuple[int, int]], Lens], size: tuple[int, int]) -> bool:
@@ -101,16 +102,45 @@ def _fits(lens: Callable[[tuple[int, int]], Lens], size: tuple[int, int]) -> boo
     return True
 
 
+def _reduction(
+    found: ImageFiles, sizes: list[tuple[int, int] | None], stated: list[tuple[int, int]]
+) -> tuple[int, list[str]]:
+    """Return how many times smaller than the model's cameras the images of a reduced folder are (1 for those of another
+    folder, which are all that there is), and a note if images are smaller."""
+    smaller = [(size, full) for size, full in zip(sizes, stated) if size is not None and size != full]
+    if not smaller:
+        return 1, []
+    size, full = smaller[0]
+    line = (
+        f"{found.folder}: images are {size_text(size)}, the model's cameras {size_text(full)}; "
+        "the cameras are scaled to the images"
+    )
+    return (max(1, round(full[0] / size[0])) if found.reduced else 1), [line]
+
+
 def _lens(model_folder: Path, image: ModelImage, camera: ModelCamera, source: tuple[int, int]) -> Lens:
-    if (camera.width, camera.height) != source:
+    """Return the lens at the size of the image, which is that of its camera or a reduced one.
+
+    Images that are only a little smaller are others, undistorted or cropped, even in the same proportions.
+    """
+    full = camera.width, camera.height
+    if full != source and not _is_reduced(source, full):
         raise UserError(
             f"{model_folder}: camera {image.camera}, of {image.name}, is of {camera.width} x {camera.height} pixels, "
             f"but the image is {size_text(source)}; give the images that the model was made from, or a model of these "
             "images"
         )
     try:
-        return make_lens(camera.model, camera.params)
+        lens = make_lens(camera.model, camera.params)
+        return lens if full == source else rescaled(lens, full, source)
     except ValueError as error:
         raise UserError(
             f"{model_folder}: camera {image.camera}, of {image.name}: {error}; undistort the images"
         ) from None
+
+
+def _is_reduced(size: tuple[int, int], full: tuple[int, int]) -> bool:
+    """Return whether an image of this size is a reduced one of the full size: the proportions are kept up to the
+    rounding to whole pixels."""
+    difference = abs(size[1] - size[0] * full[1] / full[0])
+    return size[0] * LEAST_REDUCTION <= full[0] and difference <= max(1.0, MAX_ASPECT_ERROR * size[1])

@@ -24,6 +24,7 @@ from ..images import ReadOptions, size_text
 from ..lens import Lens
 from ..natural_order import natural
 from ..points import read_points
+from .colmap_images import reduced_folders
 from .colmap_model import find_model
 from .transforms import SUFFIXES
 
@@ -39,9 +40,11 @@ MAX_ASPECT_ERROR = 0.01
 def recognises(folder: Path) -> bool:
     """Return whether the folder holds this layout, and not the COLMAP model of one camera's images, beside which LLFF
     and others keep this file."""
-    images = folder / "images"
-    alone = images.is_dir() and any(file.suffix.lower() in SUFFIXES for file in images.iterdir() if file.is_file())
-    return (folder / FILE).is_file() and not (alone and find_model(folder) is not None)
+    if not (folder / FILE).is_file():
+        return False
+    single = [path for path in (folder / "images", *reduced_folders(folder)) if path.is_dir()]
+    alone = any(file.suffix.lower() in SUFFIXES for path in single for file in path.iterdir() if file.is_file())
+    return not (alone and find_model(folder) is not None)
 
 
 def read(folder: Path, split: str, options: ReadOptions) -> Dataset:
