@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 from pathlib import Path
 
 import cv2
@@ -12,7 +13,7 @@ import torch
 
 from helpers.films import pan
 from helpers.handheld import handheld
-from helpers.layouts import write_poses_bounds
+from helpers.layouts import save_json, write_nerfies, write_poses_bounds
 from helpers.tiny import tiny_config, tiny_dataset
 from scgs_warp.data import Dataset, load
 from scgs_warp.geometry.cameras import overview
@@ -108,6 +109,24 @@ def test_points_and_bounds_tell_the_distance(tmp_path):
     rows[:, 15:] = 0.0
     np.save(tmp_path / "poses_bounds.npy", rows)
     assert load(tmp_path).bounds is None
+
+
+def test_near_and_far_of_nerfies_tell_the_distance(tmp_path):
+    """They are in the scaled world, as its programs take them."""
+    write_nerfies(tmp_path)
+    (tmp_path / "points.npy").unlink()
+    for index, file in enumerate(sorted((tmp_path / "camera").iterdir())):
+        content = json.loads(file.read_text())
+        save_json(file, content | {"orientation": np.eye(3).tolist(), "position": [0.01 * index, 0.0, 0.0]})
+    data = load(tmp_path)
+    assert data.bounds == (0.1, 9.0)
+    placed = place(data)
+    assert placed.overview.radius == pytest.approx(2.0 / (1 / 0.1 + 1 / 9.0), rel=0.02) and not placed.guessed
+    for wrong in ({"near": 9.0}, {"near": 0.0}, {"far": "x"}, {"far": None}):
+        content = json.loads((tmp_path / "scene.json").read_text())
+        save_json(tmp_path / "scene.json", content | wrong)
+        assert load(tmp_path).bounds is None
+        save_json(tmp_path / "scene.json", content)
 
 
 def test_depth_maps_tell_the_distance():

@@ -3,7 +3,7 @@
 ``dataset.json``: ``ids``, ``train_ids``, ``val_ids``; ``metadata.json``: for each id ``time_id``, or ``warp_id`` in
 older data; ``camera/ID.json``: ``orientation`` (world-to-camera, OpenCV), ``position``, ``focal_length``,
 ``principal_point``, ``skew``, ``pixel_aspect_ratio``, ``radial_distortion``, ``tangential_distortion``,
-``image_size``; ``scene.json``: ``center`` and ``scale`` of the world; ``points.npy``; ``rgb/1x/ID.png``, ``rgb/2x`` ...
+``image_size``; ``scene.json``: ``center`` and ``scale`` of the world, ``near`` and ``far`` in it; ``points.npy``; ``rgb/1x/ID.png``, ``rgb/2x`` ...
 Layout: Park et al., Nerfies, ICCV 2021; HyperNeRF, SIGGRAPH Asia 2021; Yan et al., NeRF-DS, CVPR 2023.
 
 The masks of NeRF-DS mark moving pixels, not invalid ones, and are ignored.
@@ -38,6 +38,8 @@ class World(NamedTuple):
 
     centre: np.ndarray
     scale: float
+    bounds: tuple[float, float] | None = None
+    """Nearest and farthest depth of the content, scaled; None if the file does not tell."""
 
 
 def recognises(folder: Path) -> bool:
@@ -77,6 +79,7 @@ def read(folder: Path, split: str, options: ReadOptions) -> Dataset:
         )
     reduced = options._replace(downscale=max(1.0, options.downscale / ratio))
     data = assemble(records, reduced, folder=folder, split=split, notes=choice.notes)
+    data.bounds = world.bounds
     return with_points(data, _points(folder / "points.npy", world), None)
 
 
@@ -152,7 +155,9 @@ def _world(path: Path) -> World:
         raise UserError(f"{path}: center is missing or not three numbers; restore it, or remove the file")
     if scale is None or scale <= 0:
         raise UserError(f"{path}: scale is missing or not a positive number; restore it, or remove the file")
-    return World(centre, scale)
+    near, far = as_number(content.get("near")), as_number(content.get("far"))
+    told = near is not None and far is not None and 0.0 < near < far
+    return World(centre, scale, (near, far) if told else None)
 
 
 def _images(folder: Path, downscale: float) -> tuple[Path, int]:
