@@ -3,7 +3,8 @@
 ``dataset.json``: ``ids``, ``train_ids``, ``val_ids``; ``metadata.json``: for each id ``time_id``, or ``warp_id`` in
 older data; ``camera/ID.json``: ``orientation`` (world-to-camera, OpenCV), ``position``, ``focal_length``,
 ``principal_point``, ``skew``, ``pixel_aspect_ratio``, ``radial_distortion``, ``tangential_distortion``,
-``image_size``; ``scene.json``: ``center`` and ``scale`` of the world, ``near`` and ``far`` in it; ``points.npy``; ``rgb/1x/ID.png``, ``rgb/2x`` ...
+``image_size``; ``scene.json``: ``center`` and ``scale`` of the world, and ``near`` and ``far`` in it; ``points.npy``;
+``rgb/1x/ID.png``, ``rgb/2x`` ...
 Layout: Park et al., Nerfies, ICCV 2021; HyperNeRF, SIGGRAPH Asia 2021; Yan et al., NeRF-DS, CVPR 2023.
 
 The masks of NeRF-DS mark moving pixels, not invalid ones, and are ignored.
