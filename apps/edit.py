@@ -74,19 +74,19 @@ def check(options: Options) -> None:
     Raises:
         UserError: names the option and the remedy.
     """
+    from scgs_warp.config.bounds import MOST_NODES
     from scgs_warp.errors import UserError
     from scgs_warp.export.request import STILL_FORMATS, SUFFIXES, Format, check_output, output_suffix
-    from scgs_warp.motion.static_nodes import MAX_COUNT
     from scgs_warp.visualization import video
 
     if (options.run is None) == (options.ply is None):
         raise UserError("edit.py: give one of --run and --ply")
     if options.up is not None and options.ply is None:
         raise UserError(f"--up {options.up}: belongs to --ply; a run knows from its cameras what is up")
-    if options.nodes is not None and not 1 <= options.nodes <= MAX_COUNT:
-        raise UserError(f"--nodes {options.nodes}: give 1 to {MAX_COUNT}")
-    if options.parts is not None and not 1 <= options.parts <= MAX_COUNT:
-        raise UserError(f"--parts {options.parts}: give 1 to {MAX_COUNT}")
+    if options.nodes is not None and not 1 <= options.nodes <= MOST_NODES:
+        raise UserError(f"--nodes {options.nodes}: give 1 to {MOST_NODES}")
+    if options.parts is not None and not 1 <= options.parts <= MOST_NODES:
+        raise UserError(f"--parts {options.parts}: give 1 to {MOST_NODES}")
     if options.skeleton and (options.output is not None or options.export is not None):
         raise UserError("--skeleton prints and ends; leave --output and --export out")
     if options.size is not None and not 16 <= options.size <= 8192:

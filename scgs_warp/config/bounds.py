@@ -7,6 +7,9 @@ from typing import Any
 
 MAGNITUDE = 1e9
 """Largest value of a number without a limit of its own."""
+MOST_NODES = 20_000
+"""Largest number of control points that may be asked for. Where fewer places offer themselves, fewer are made, so that
+runs may have recorded a larger number."""
 
 
 def bounded(default: float, least: float, most: float = MAGNITUDE, **more: Any) -> Any:

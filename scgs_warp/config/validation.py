@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping
 from typing import Any
 
 from ..errors import UserError
-from .bounds import MAGNITUDE
+from .bounds import MAGNITUDE, MOST_NODES
 from .presets import TrainConfig
 
 LARGEST_NETWORKS = 64 * 2_048**2
@@ -46,6 +46,11 @@ def _check_rules(config: TrainConfig) -> None:
         raise UserError(f"motion.chunks is {motion.chunks}; --motion {motion.model} has no network: leave it out")
     if motion.nodes < motion.neighbors + 1:
         raise UserError(f"--nodes {motion.nodes}: needs at least {motion.neighbors + 1}")
+    if motion.nodes > MOST_NODES:
+        raise UserError(
+            f"--nodes {motion.nodes}: choose at most {MOST_NODES}; a Gaussian follows {motion.neighbors} of them, and "
+            "sampling more takes hours"
+        )
     if config.densify.max_gaussians < 100:
         raise UserError(f"--max-gaussians {config.densify.max_gaussians}: needs at least 100")
 

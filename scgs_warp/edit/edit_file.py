@@ -12,8 +12,8 @@ from typing import Any, get_args
 
 import numpy as np
 
+from ..config.bounds import MOST_NODES
 from ..errors import UserError
-from ..motion.static_nodes import MAX_COUNT
 from . import skeleton_file
 from .document import Edit, Film, Shot, View, film_fields, ordered_views, shot_fields, view_fields
 from .engine import Engine
@@ -69,7 +69,7 @@ def to_json(edit: Edit, engine: Engine) -> str:
 def control_points_of(path: Path) -> int:
     """Return the number of control points of the scene for which an edit was saved; 0 if the file does not say."""
     scene = FieldReader(read_object(path), str(path)).child("scene")
-    return 0 if scene is None else scene.integer("control_points", 0, 0, MAX_COUNT)
+    return 0 if scene is None else scene.integer("control_points", 0, 0, MOST_NODES)
 
 
 def checked(edit: Edit, engine: Engine) -> Edit:

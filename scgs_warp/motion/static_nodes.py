@@ -16,8 +16,6 @@ from .base import Motion
 
 COUNT = 512
 """Default number of control points."""
-MAX_COUNT = 20_000
-"""Largest number of control points that may be asked for."""
 NEIGHBORS = 4
 OPAQUE = 0.1
 """Opacity above which a Gaussian is a candidate for control points; farthest-point sampling would favour floaters,

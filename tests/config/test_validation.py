@@ -101,6 +101,7 @@ def test_choices_are_inclusive(name):
     ("name", "value", "message"),
     [
         ("motion.nodes", 4, "--nodes 4: needs at least 5"),
+        ("motion.nodes", 100_000, "--nodes 100000: choose at most 20000; a Gaussian follows 4 of them"),
         ("densify.max_gaussians", 99, "--max-gaussians 99: needs at least 100"),
         ("pretrain.steps", 80_000, "steps 40000 leave nothing after 80000 pre-training steps; raise --steps"),
         ("optim.settle", 1.5, "optim.settle is 1.5; it must be at most 1"),
