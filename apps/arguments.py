@@ -91,6 +91,7 @@ def one_line_errors(name: str, words: Sequence[str], *kinds: type) -> Iterator[N
     Args:
         kinds: dataclasses of the options, from which the remedies are taken.
     """
+    _refuse_empty_paths(words, *kinds)
     said, columns = io.StringIO(), os.environ.get("COLUMNS")
     asks = any(word in ("-h", "--help") for word in words)
     if not asks:
@@ -107,6 +108,15 @@ def one_line_errors(name: str, words: Sequence[str], *kinds: type) -> Iterator[N
             os.environ.pop("COLUMNS")
             if columns is not None:
                 os.environ["COLUMNS"] = columns
+
+
+def _refuse_empty_paths(words: Sequence[str], *kinds: type) -> None:
+    """Refuse empty names of files and folders, as of a variable that a script has not set: ``Path`` would take them for
+    the current folder."""
+    parts = [part for word in words for part in (word.split("=", 1) if word.startswith("--") else [word])]
+    for option, value in pairwise(parts):
+        if option.startswith("--") and not value.strip() and "Path" in _hint(option, *kinds):
+            raise UserError(f"{option}: is followed by an empty name; name a file or folder, or leave {option} out")
 
 
 def explain(text: str, name: str, words: Sequence[str], *kinds: type) -> str:

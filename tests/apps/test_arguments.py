@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import shutil
 import subprocess
 import sys
@@ -110,3 +111,26 @@ def test_bash_completes(tmp_path):
     assert offered("scgs-warp", "tr") == {"train"}
     assert "--downscale" in offered("scgs-warp", "train", "--down")
     assert {"quick", "cpu", "best", "paper"} <= offered("scgs-warp", "train", "--preset", "''")
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["train", "--output", ""],
+        ["train", "--data="],
+        ["evaluate", "--run", " "],
+        ["view", "--run", "", "--output", "x.mp4"],
+        ["edit", "--run", ""],
+        ["export", "--run", "a", "--output", ""],
+        ["capture", "a", "--output", ""],
+        ["synthesize", "--output", ""],
+    ],
+    ids=" ".join,
+)
+def test_an_empty_name_is_not_the_current_folder(words, tmp_path, monkeypatch, capsys):
+    """As of a variable that a script has not set."""
+    monkeypatch.chdir(tmp_path)
+    assert importlib.import_module(f"scgs_warp.apps.{words[0]}").cli(words[1:]) == 2
+    said = capsys.readouterr().err
+    assert "is followed by an empty name" in said and said.count("\n") == 1
+    assert not list(tmp_path.iterdir())
