@@ -1,7 +1,7 @@
 """A furnished room with patterned walls, filmed by a camera on a known path while something moves in it.
 
-``python tests/helpers/room.py --output room.mp4 --frames 240 --size 640 480`` makes a film for ``apps/capture.py``
-and the true camera centres beside it (``room.npz``).
+``python tests/helpers/room.py --output room.mp4 --frames 240 --size 640 480`` makes a film for ``apps/capture.py``,
+and beside it the true cameras and the pixels that show what moves (``room.npz``).
 """
 
 from __future__ import annotations
@@ -192,7 +192,10 @@ def main() -> None:
     options = parser.parse_args()
     made = shoot(options.frames, *options.size)
     save(made, options.output)
-    np.savez(options.output.with_suffix(".npz"), centres=made.centres, viewmats=made.viewmats, K=made.K)
+    moving = np.packbits(np.stack(made.moving), axis=-1)
+    np.savez_compressed(
+        options.output.with_suffix(".npz"), centres=made.centres, viewmats=made.viewmats, K=made.K, moving=moving
+    )
     share = np.mean([mask.mean() for mask in made.moving])
     print(f"{options.output}: {options.frames} frames; {100 * share:.0f} % of the pixels move")
 

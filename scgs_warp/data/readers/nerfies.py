@@ -157,8 +157,8 @@ def _world(path: Path) -> World:
     if scale is None or scale <= 0:
         raise UserError(f"{path}: scale is missing or not a positive number; restore it, or remove the file")
     near, far = as_number(content.get("near")), as_number(content.get("far"))
-    told = near is not None and far is not None and 0.0 < near < far
-    return World(centre, scale, (near, far) if told else None)
+    bounds = None if near is None or far is None or not 0.0 < near < far else (near, far)
+    return World(centre, scale, bounds)
 
 
 def _images(folder: Path, downscale: float) -> tuple[Path, int]:
