@@ -79,6 +79,9 @@ def test_a_mover_no_longer_pulls_cameras(model, tmp_path, monkeypatch):
     made = read_model(tmp_path / "adjusted")
     assert len(rounds) == ROUNDS
     assert pulled.max() > 0.005 and errors(made).max() < 0.001
+    seen = [point.track.length() for _, point in sorted(made.points3D.items())]
+    assert sum(seen[:POINTS]) == VIEWS * POINTS, "what stands still is seen as before"
+    assert sum(seen[POINTS:]) < 0.8 * MOVING * len(WITH_MOVER), "strays are gone"
 
 
 def test_a_model_without_points_is_left_as_it_is(model, tmp_path):
