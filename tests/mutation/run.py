@@ -8,6 +8,7 @@ survives if they all pass. The checkout is never changed.
 from __future__ import annotations
 
 import argparse
+import importlib
 import json
 import math
 import os
@@ -18,6 +19,7 @@ import subprocess
 import sys
 import tempfile
 import time
+import types
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -64,13 +66,11 @@ def prepare(copy: Path, kernels: Path) -> None:
     sys.dont_write_bytecode = True
     sys.path[:] = [str(copy), str(copy / "tests"), *(p for p in sys.path if p not in (str(ROOT), str(ROOT / "tests")))]
     os.chdir(copy)
-    import importlib.util
-
-    spec = importlib.util.spec_from_file_location("environment_of_runner", copy / "scgs_warp/runtime/environment.py")
-    assert spec is not None and spec.loader is not None
-    module = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(module)
-    module.prepare_environment()
+    # Under another name, since mutants are imported as scgs_warp.
+    for name, folder in (("original", "scgs_warp"), ("original.runtime", "scgs_warp/runtime")):
+        sys.modules[name] = package = types.ModuleType(name)
+        package.__path__ = [str(copy / folder)]
+    importlib.import_module("original.runtime.environment").prepare_environment()
     import _pytest.assertion.rewrite
     import cv2  # noqa: F401
     import hypothesis  # noqa: F401
