@@ -12,7 +12,7 @@ comes from ``results/sharing-NAME.json``, one-process runs from ``results/sharin
 The table of edits comes from ``results/edit-cpu.json`` and ``results/edit-4096-cpu.json`` (``apps/bench.py edit``, with
 and without ``--nodes 4096``), that of meshes from ``results/mesh-distance.json`` (``mesh_distance.py``), that of edges
 of masks from ``results/mask-edges.json`` (``mask_edges.py``), that of optical flow from ``results/optical-flow.json``
-(``optical_flow.py``), that of means from ``results/mean-of-runs.json`` (``mean_of_runs.py``), that of long films from
+(``optical_flow.py``), those of a filmed room from ``results/filmed-room.json`` (``filmed_room.py``), that of means from ``results/mean-of-runs.json`` (``mean_of_runs.py``), that of long films from
 ``results/long-film-memory.json`` (``long_film.py memory``). Those of pages come from ``results/page-million.json``
 (``page_frames.py``) and ``results/live-cost.json`` (``live_cost.py``), and that of soaks from
 ``results/chaos-PART.json`` (``chaos.py --part PART --minutes 118``).
@@ -125,6 +125,39 @@ def optical_flow(results: Results) -> str:
     return table(["flow", "error, pixels", "of what moves", "of what is trusted", "trusted", "processor time"], lines)
 
 
+CAPTURES = {
+    "room": "default number of frames",
+    "room-no-masks": "default number, `--masks none`",
+    "room-75": "`--frames 75`",
+}
+"""Captures of the film of the room, by the names of their folders."""
+
+
+def film_captures(results: Results) -> str:
+    """Write how far the cameras of captures of one film are from the truth, before and after their adjustment."""
+    lines = []
+    for row in results["filmed-room"]["captures"]:
+        errors = (f"{100 * row[mean]:.3f} %, {100 * row[worst]:.2f} %" for mean, worst in
+                  (("mapped_mean", "mapped_worst"), ("mean", "worst")))  # fmt: skip
+        picked = [str(row["picked"]), str(row["registered"])]
+        lines.append([CAPTURES[row["capture"]], *picked, *errors, f"{100 * row['focal']:+.2f} %"])
+    head = ["capture", "picked", "registered", "centres off, as mapped", "adjusted", "focal length"]
+    return table(head, lines)
+
+
+def film_views(results: Results) -> str:
+    """Write the scores of the held-out frames of a run on the film of the room."""
+    one = results["filmed-room"]["views"]
+    head = [f"{one['frames']} held-out frames, `{one['preset']} --steps {one['steps']}`", "PSNR"]
+    lines = [
+        ["whole", f"{one['psnr']:.2f} dB"],
+        ["worst frame", f"{one['worst']:.2f} dB"],
+        [f"the box, {100 * one['share']:.0f} % of the pixels", f"{one['box']:.2f} dB"],
+        ["all but the box", f"{one['rest']:.2f} dB"],
+    ]
+    return table(head, lines)
+
+
 def long_film_memory(results: Results) -> str:
     """Write how much memory reading a film takes, by its length."""
     lines = []
@@ -200,6 +233,8 @@ REPEATABLE = {
     "mesh-distance": Repeatable(mesh_distance, ("mesh-distance",), MESHES),
     "capture-mask-edges": Repeatable(mask_edges, ("mask-edges",), ("scgs_warp/capture/moving.py",)),
     "capture-optical-flow": Repeatable(optical_flow, ("optical-flow",), ("scgs_warp/geometry/optical_flow.py",)),
+    "capture-films": Repeatable(film_captures, ("filmed-room",), ("scgs_warp/capture",)),
+    "capture-film-views": Repeatable(film_views, ("filmed-room",), ("scgs_warp/capture", *TRAINING)),
     "capture-long-films": Repeatable(
         long_film_memory, ("long-film-memory",), ("scgs_warp/training/silhouettes.py", "scgs_warp/data/cache.py")
     ),
