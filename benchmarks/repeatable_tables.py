@@ -12,10 +12,11 @@ comes from ``results/sharing-NAME.json``, one-process runs from ``results/sharin
 The table of edits comes from ``results/edit-cpu.json`` and ``results/edit-4096-cpu.json`` (``apps/bench.py edit``, with
 and without ``--nodes 4096``), that of meshes from ``results/mesh-distance.json`` (``mesh_distance.py``), that of edges
 of masks from ``results/mask-edges.json`` (``mask_edges.py``), that of optical flow from ``results/optical-flow.json``
-(``optical_flow.py``), those of a filmed room from ``results/filmed-room.json`` (``filmed_room.py``), that of means from ``results/mean-of-runs.json`` (``mean_of_runs.py``), that of long films from
-``results/long-film-memory.json`` (``long_film.py memory``). Those of pages come from ``results/page-million.json``
-(``page_frames.py``) and ``results/live-cost.json`` (``live_cost.py``), and that of soaks from
-``results/chaos-PART.json`` (``chaos.py --part PART --minutes 118``).
+(``optical_flow.py``), those of a filmed room from ``results/filmed-room.json`` (``filmed_room.py``), that of means from
+``results/mean-of-runs.json`` (``mean_of_runs.py``), that of long films from ``results/long-film-memory.json``
+(``long_film.py memory``). Those of pages come from ``results/page-million.json`` (``page_frames.py``) and
+``results/live-cost.json`` (``live_cost.py``), and that of soaks from ``results/chaos-PART.json`` (``chaos.py --part
+PART --minutes 118``).
 """
 
 from __future__ import annotations
