@@ -2,7 +2,9 @@
 
 COLMAP's mapper sums squared errors of all observations that it accepts. Where a mover fills a good part of a frame and
 goes along its epipolar lines, the mapper accepts its features, and they pull the camera off. A Cauchy loss lets an
-observation pull less the worse it fits.
+observation pull less the worse it fits. The result is taken only if it moves some cameras far more than the cameras
+beside them: where it changes all alike, nothing tells that the mapper's cameras were worse, and a film of a hand scored
+higher with them.
 """
 
 from __future__ import annotations
@@ -14,20 +16,29 @@ from typing import Any
 import numpy as np
 
 from .colmap import quiet, read_model, write_model
+from .similarity import align
 
 ROBUST = 0.5
 """Reprojection error, pixels, beyond which an observation pulls less and less."""
 ROUNDS, ITERATIONS = 3, 8
 """Number of solutions, between which strays are removed, and of iterations of each. More hardly change the cameras."""
+NEIGHBOURS = 4
+"""Number of cameras before and after one with whose shift its own is compared."""
+PULLED = 10.0
+"""Ratio of the largest to the median such difference above which cameras were pulled off."""
 STRAY, STRAY_FACTOR = 2.0, 6.0
 """Reprojection error, pixels, and factor on the median error, above both of which an observation is removed."""
 
 
-def adjust_model(source: Path, target: Path, done: Callable[[], object]) -> None:
-    """Adjust the model in a folder, without strays, and write it to another folder.
+def adjust_model(source: Path, target: Path, done: Callable[[], object]) -> bool:
+    """Adjust the model in a folder, without strays, and write it to another folder; write it as it was if no camera was
+    pulled off.
 
     Args:
         done: called after each of ``ROUNDS``.
+
+    Returns:
+        Whether the adjusted model was written.
 
     Raises:
         UserError: the model is damaged, or cannot be written.
@@ -38,7 +49,27 @@ def adjust_model(source: Path, target: Path, done: Callable[[], object]) -> None
             _remove_strays(model)
         adjust(model, distortion=True, iterations=ITERATIONS)
         done()
-    write_model(model, target)
+    mapped = read_model(source)
+    pulled = were_pulled(_centres(mapped), _centres(model))
+    write_model(model if pulled else mapped, target)
+    return pulled
+
+
+def were_pulled(before: np.ndarray, after: np.ndarray) -> bool:
+    """Return whether some of the camera centres [V, 3], in the order of the frames, moved far more than those beside
+    them."""
+    shifts, count = align(before, after).points(before) - after, len(after)
+    around = [
+        np.median(np.delete(shifts[max(k - NEIGHBOURS, 0) : k + NEIGHBOURS + 1], min(k, NEIGHBOURS), axis=0), axis=0)
+        for k in range(count)
+    ]
+    apart = np.linalg.norm(shifts - np.stack(around), axis=1)
+    return bool(apart.max() > PULLED * np.median(apart))
+
+
+def _centres(model: Any) -> np.ndarray:
+    images = sorted((image for image in model.images.values() if image.has_pose), key=lambda image: image.name)
+    return np.stack([image.projection_center() for image in images])
 
 
 def adjust(model: Any, distortion: bool, iterations: int | None = None) -> float:

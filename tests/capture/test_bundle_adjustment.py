@@ -75,7 +75,7 @@ def test_a_mover_no_longer_pulls_cameras(model, tmp_path, monkeypatch):
         adjust(model, distortion=True)
     pulled, rounds = errors(model), []
     write_model(model, tmp_path / "model")
-    adjust_model(tmp_path / "model", tmp_path / "adjusted", lambda: rounds.append(1))
+    assert adjust_model(tmp_path / "model", tmp_path / "adjusted", lambda: rounds.append(1))
     made = read_model(tmp_path / "adjusted")
     assert len(rounds) == ROUNDS
     assert pulled.max() > 0.005 and errors(made).max() < 0.001
@@ -84,9 +84,17 @@ def test_a_mover_no_longer_pulls_cameras(model, tmp_path, monkeypatch):
     assert sum(seen[POINTS:]) < 0.8 * MOVING * len(WITH_MOVER), "strays are gone"
 
 
+def test_cameras_that_nothing_pulled_stay_as_they_were(model, tmp_path):
+    for number in sorted(model.points3D)[POINTS:]:
+        model.delete_point3D(number)
+    write_model(model, tmp_path / "model")
+    assert not adjust_model(tmp_path / "model", tmp_path / "adjusted", lambda: None)
+    assert errors(read_model(tmp_path / "adjusted")).max() < 1e-9
+
+
 def test_a_model_without_points_is_left_as_it_is(model, tmp_path):
     for number in list(model.points3D):
         model.delete_point3D(number)
     write_model(model, tmp_path / "model")
-    adjust_model(tmp_path / "model", tmp_path / "adjusted", lambda: None)
+    assert not adjust_model(tmp_path / "model", tmp_path / "adjusted", lambda: None)
     assert errors(read_model(tmp_path / "adjusted")).max() < 1e-9
