@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 import re
 import shutil
@@ -95,7 +96,7 @@ def examined(program: str, check: Check, seconds: float) -> Report:
             text=True,
             errors="replace",
             check=False,
-            timeout=seconds,
+            timeout=seconds if math.isfinite(seconds) else None,
         )
     except subprocess.TimeoutExpired:
         raise Unfinished(f"{check.tool or 'the program alone'} took more than the {seconds:.0f} s left") from None

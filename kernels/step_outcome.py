@@ -103,8 +103,9 @@ def report(
     ssim_in: wp.array[float],  # [1]
     regulariser_in: wp.array[float],  # [1]
     has_regulariser: int,
+    shown_in: wp.array[float],  # [1] largest alpha
     # Out:
-    report_out: wp.array[wp.float64],  # [6] in the order of the arguments
+    report_out: wp.array[wp.float64],  # [7] in the order of the arguments
 ):
     """Collect what the host reads. Grid: 1."""
     i = first + wp.tid()
@@ -116,3 +117,4 @@ def report(
     report_out[5] = wp.float64(0.0)
     if has_regulariser != 0:
         report_out[5] = wp.float64(regulariser_in[i])
+    report_out[6] = wp.float64(shown_in[i])

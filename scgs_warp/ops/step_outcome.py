@@ -14,7 +14,7 @@ from ..kernels.types import ADAM_CHUNK
 from ..runtime.launch import launch
 from .adam import element_chunks, table
 
-REPORT_SIZE = 6
+REPORT_SIZE = 7
 
 
 class Moments(NamedTuple):
@@ -46,11 +46,13 @@ class StepOutcome:
         terms = loss.detach().view(1), _flat(regulariser), int(regulariser is not None)
         launch(kernels.judge_loss, 1, pairs, room, *terms, self.halted, self.value)
 
-    def report(self, pairs: Tensor, loss: Tensor, l1: Tensor, ssim: Tensor, regulariser: Tensor | None) -> Tensor:
-        """Return outcome, pairs and the four scalars, [6] float64."""
+    def report(
+        self, pairs: Tensor, loss: Tensor, l1: Tensor, ssim: Tensor, regulariser: Tensor | None, shown: Tensor
+    ) -> Tensor:
+        """Return outcome, pairs and the five scalars, [7] float64."""
         found = torch.empty(REPORT_SIZE, dtype=torch.float64, device=pairs.device)
         terms = (*(_flat(term) for term in (loss, l1, ssim, regulariser)), int(regulariser is not None))
-        launch(kernels.report, 1, self.value, pairs, *terms, found)
+        launch(kernels.report, 1, self.value, pairs, *terms, _flat(shown), found)
         return found
 
 

@@ -105,8 +105,11 @@ def _captured(graph: torch.cuda.CUDAGraph, stream: torch.cuda.Stream, pool: Any)
             graph.capture_begin(**({} if pool is None else {"pool": pool}), capture_error_mode="thread_local")
             try:
                 yield
-            finally:
-                graph.capture_end()
+            except BaseException:
+                with contextlib.suppress(RuntimeError):  # it would hide the cause
+                    graph.capture_end()
+                raise
+            graph.capture_end()
     finally:
         if collects:
             gc.enable()

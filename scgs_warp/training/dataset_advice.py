@@ -234,7 +234,7 @@ def advise(facts: Survey, config: TrainConfig, device: str = "cpu") -> tuple[str
 
 
 def _content(facts: Survey) -> str:
-    """Say what the images show: it decides how parts that do not fit are treated (``state.resolve_auto``)."""
+    """Say what the images show: it decides how parts that do not fit are treated (``automatic.resolve_auto``)."""
     if not facts.cut_out:
         return "filled images"
     if facts.thin:
@@ -290,7 +290,7 @@ def progressive_without_effect(config: TrainConfig, frames: int, points: int) ->
         return f"--progressive has no effect with --motion {config.motion.model}, which has no stage 1"
     if pretrain.steps == 0:
         return "--progressive has no effect without stage 1: pretrain.steps is 0"
-    if points >= enough and not pretrain.with_points:  # as state.resolve_auto
+    if points >= enough and not pretrain.with_points:  # as automatic.resolve_auto
         return (
             "--progressive has no effect: the data's points take the place of stage 1; "
             "--set pretrain.with_points=true keeps that stage"

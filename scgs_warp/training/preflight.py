@@ -28,7 +28,7 @@ CHOSEN_BY_THE_DATA = (
     "pretrain.fade",
     "pretrain.steps",
 )
-"""Settings that ``state.resolve_auto`` may change, so that they can be compared only when the data is known."""
+"""Settings that ``automatic.resolve_auto`` may change, so that they can be compared only when the data is known."""
 
 
 def refuse_early(config: TrainConfig, output: Path, resume: bool) -> None:

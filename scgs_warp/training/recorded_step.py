@@ -7,7 +7,7 @@ Steps that consist of the same operations are recorded as a CUDA graph and repla
 
 The result is that of ``step.training_step``, which takes the steps that cannot be taken this way: those of several
 views, of refined cameras, of frames with affine colours, that compare flow, with debug checks, with lists beyond the
-memory, or soon after one whose view showed nothing (``vanishing``). On a CPU the same operations run one by one, which
+memory, or that may draw back Gaussians (``recall``). On a CPU the same operations run one by one, which
 is how they are tested.
 """
 
@@ -27,11 +27,11 @@ from ..runtime.cuda_graph import GraphMemory
 from .depth import depth_applies
 from .flow import flow_applies
 from .frames import Frames
+from .recall import shows_too_little
 from .recorded_update import Kind, RecordedUpdate
 from .state import StepResult, TrainState
 from .step import set_rates, training_step
-from .vanishing import RECALLED, should_show
-from .view import View, prepare
+from .view import View, may_recall, prepare
 
 PAIRS_PER_GAUSSIAN = 4
 """Ratio of the capacity to the number of Gaussians before anything is known of the pairs."""
@@ -89,7 +89,6 @@ class RecordedSteps:
         self._records_from: dict[Hashable, int] = {}
         self._told: set[bool] = set()
         self._most_pairs = 0
-        self._recalls_until = 0
         self._memory = GraphMemory()
         self._pending: deque[_Submitted] = deque()
         self._update: RecordedUpdate | None = None
@@ -136,7 +135,7 @@ class RecordedSteps:
         ready = state.motion.takes_time_tensor and not state.refines_cameras and not len(state.exposure)
         if state.stage == "main":
             ready = ready and not flow_applies(state.stage_step, state.config)
-        if not ready or debug.enabled() or state.step < self._recalls_until:
+        if not ready or debug.enabled() or may_recall(state):
             return False
         if self.capacity > 0 and self._update is not None and self._update.holds():
             return True
@@ -208,13 +207,13 @@ class RecordedSteps:
         first = self._pending[0]
         if first.done is not None:
             first.done.synchronize()
-        outcome, pairs, loss, l1, ssim, regulariser = first.report.tolist()
+        outcome, pairs, loss, l1, ssim, regulariser, shown = first.report.tolist()
         self._most_pairs = max(self._most_pairs, int(pairs))
         if outcome == STEP_HALTED:
             return self._repeat(int(pairs))
         self._pending.popleft()
-        if pairs == 0 and should_show(l1):
-            self._recalls_until = first.step.number + RECALLED
+        if shows_too_little(shown, l1):
+            self._state.recalls = self._state.recalls.after_nothing_shown(first.step.number)
         failed = None if outcome == STEP_FINE else _name(int(outcome), first.kind.names)
         if failed is not None:
             _take_back(first)

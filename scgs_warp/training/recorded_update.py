@@ -210,7 +210,7 @@ class RecordedUpdate:
             logits = state.gaussians.opacity_logits.data
             logits.copy_(torch.where(self.outcome.value == STEP_FINE, logits.clamp(min=least), logits))
         terms = compared.loss, compared.l1, compared.ssim, compared.regulariser
-        return self.outcome.report(most, *terms), compared.picture.detach()
+        return self.outcome.report(most, *terms, compared.shown), compared.picture.detach()
 
     def _on_device(self, view: View) -> Numbers:
         cells = self._inputs[:DEPTH].float()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from pathlib import Path
 from typing import Literal, NamedTuple
 
@@ -16,7 +15,7 @@ from ..data.dataset import Dataset
 from ..errors import UserError
 from ..gaussians import GaussianParameters
 from ..geometry.cameras import Overview
-from ..geometry.normalisation import COMMON_RADIUS, FEWEST_POINTS, Normalisation
+from ..geometry.normalisation import COMMON_RADIUS, Normalisation
 from ..motion import ControlPoints
 from ..motion.base import Motion
 from ..motion.spheres import Spheres
@@ -27,11 +26,11 @@ from ..scene.validation import check_metadata, check_motion, check_resumed, chec
 from ..seeding import generator
 from ..storage import checkpoint
 from ..types import Stats
+from .automatic import has_initial_points, resolve_auto
 from .background_points import background_points
 from .camera_refinement import CameraRefinement
 from .depth import depth_applies
 from .exposure import Exposure
-from .flow import follow_each_other
 from .frames import first_frames
 from .initial_points import random_points, sample_initial_points
 from .points_on_movers import points_on_movers
@@ -45,10 +44,10 @@ from .pretrain import (
     thin_spheres,
 )
 from .process_group import ProcessGroup
+from .recall import Window
 from .resuming import check_same_configuration, check_same_frames, check_steps
 from .scene_distance import place
-from .second_config import may_be_tried_again
-from .silhouettes import half_thickness, is_in_parts, is_thin
+from .silhouettes import half_thickness
 from .start_motion import SeenMotion, learn_motion
 from .stereo_depth import StereoDepths, stereo_depths
 
@@ -103,6 +102,8 @@ class TrainState:
         self.stage: Stage = stage
         self.step, self.fingerprint = step, fingerprint
         self.failures = 0
+        self.recalls = Window()
+        """Steps that may draw back Gaussians, if a step has a single view."""
         self.group: ProcessGroup | None = None
         """Processes that share each step's views; not part of a checkpoint."""
         self.images: dict[str, str] = {}
@@ -240,6 +241,7 @@ class TrainState:
             "stage": self.stage,
             "extent": self.extent,
             "failures": self.failures,
+            "recalls": list(self.recalls),
             "frames": self.fingerprint,
             "images": self.images,
         }
@@ -296,57 +298,13 @@ class TrainState:
             stats = checkpoint.strip(tensors, "stats.")
             state.stats = Stats(stats["grad_norm"], stats["count"], stats["max_radii"], absolute=state.stats.absolute)
             state.failures = int(metadata["failures"])
+            state.recalls = Window(*map(int, metadata.get("recalls", ())))
         except (KeyError, IndexError, ValueError, RuntimeError, TypeError) as error:
             raise UserError(f"{source}: cannot be resumed ({reason(error)}); train again without --resume") from error
         state.motion.eval()
         check_motion(state.scene(), source, config.motion.chunks)
         state.motion.train()
         return state
-
-
-def has_initial_points(data: Dataset, config: TrainConfig) -> bool:
-    """Decide whether the data has enough initial points to locate the scene and to sample control points from. Fewer
-    points are noise of a failed reconstruction."""
-    fewest = max(FEWEST_POINTS, config.motion.neighbors + 1)
-    return data.points is not None and len(data.points) >= fewest
-
-
-def resolve_auto(config: TrainConfig, data: Dataset) -> TrainConfig:
-    """Replace ``auto`` values by those that suit the data. The gains below are for a hand over a shelf, 128 x 96
-    pixels.
-
-    Images without alpha show a full background. Its bare walls need large Gaussians (not pruning them gains 1.9 dB),
-    and much of it is static beside moving surfaces (hyper-coordinates gain 0.55 dB; a motion mask gains 0.2 dB alone,
-    and nothing in addition to them). If the data has points, control points start as a sample of them and Gaussians
-    start at them (2 dB better than finding both with spheres).
-
-    Thin subjects get the pooled residual. Where the subject is in separate parts and silhouettes lead spheres back to
-    them, spheres may not fade. Subjects that are not thin may get a second try at stage 1.
-    """
-    filled = not data.with_alpha
-    motion, growth = config.motion, config.densify
-    if filled:
-        hyper_dim = max(motion.hyper_dim, motion.hyper_dim_filled)
-        config = replace(config, motion=replace(motion, hyper_dim=hyper_dim))
-    if growth.prune_large == "auto":
-        config = replace(config, densify=replace(growth, prune_large="never" if filled else "always"))
-    if filled:  # Much of a photo is covered by Gaussians of which each contributes little.
-        config = replace(config, densify=replace(config.densify, faint_share=0.0))
-    else:  # Beside a cut-out subject every Gaussian is contradicted by the background of some view.
-        config = replace(config, densify=replace(config.densify, least_views=1, clear_distance=0.0))
-    thin = "auto" in (config.loss.pooled, config.pretrain.fade, config.pretrain.arap_by) and is_thin(data)
-    if config.loss.pooled == "auto":
-        config = replace(config, loss=replace(config.loss, pooled="always" if thin else "never"))
-    if config.pretrain.fade == "auto":
-        led = config.pretrain.silhouette > 0 and not thin and is_in_parts(data)
-        config = replace(config, pretrain=replace(config.pretrain, fade="never" if led else "always"))
-    if config.pretrain.arap_by == "auto" and not may_be_tried_again(config, data, thin):
-        config = replace(config, pretrain=replace(config.pretrain, arap_by="track"))
-    if config.loss.flow > 0.0 and not follow_each_other(data):
-        config = replace(config, loss=replace(config.loss, flow=0.0))
-    if has_initial_points(data, config) and not config.pretrain.with_points:
-        config = replace(config, init_from="points", pretrain=replace(config.pretrain, steps=0))
-    return config
 
 
 class InitialPoints(NamedTuple):

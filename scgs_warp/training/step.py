@@ -17,6 +17,7 @@ from .depth import SeenDepth
 from .flow import FlowNumbers, flow_weight
 from .frames import Frames
 from .multi_view import all_views
+from .recall import shows_too_little
 from .state import StepResult, TrainState
 from .view import Numbers, View, compare, prepare
 
@@ -85,6 +86,8 @@ def one_view(state: TrainState, frames: Frames, view: int, stats: Stats) -> Step
     failed = _non_finite_term(compared.loss, compared.regulariser)
     if failed is None:
         compared.total.backward()
+    if state.config.batch == 1 and shows_too_little(float(compared.shown), float(compared.l1.detach())):
+        state.recalls = state.recalls.after_nothing_shown(state.step)
     weighted = 0.0 if compared.regulariser is None else float(compared.regulariser.detach())
     losses = (compared.loss.detach(), compared.l1.detach(), compared.ssim.detach(), weighted)
     size = given.width, given.height

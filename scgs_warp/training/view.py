@@ -1,7 +1,7 @@
 """One training view: prepared on the host, then posed, rendered and compared on the device.
 
 :func:`prepare` draws all random numbers and reads the images; :func:`compare` neither waits for the device nor copies
-from the host, so that a step can be recorded (``recorded_step``).
+from the host, so that a step can be recorded (``recorded_step``), unless it may draw back Gaussians (``recall``).
 """
 
 from __future__ import annotations
@@ -23,9 +23,9 @@ from .depth import SeenDepth, depth_term, depth_weight
 from .exposure import exposed
 from .flow import Flow, FlowNumbers, flow_term, flow_weight
 from .frames import Frames, view_number
+from .recall import recall, shows_too_little
 from .silhouettes import SilhouetteSample, silhouette_term
 from .state import TrainState
-from .vanishing import recall
 
 
 class View(NamedTuple):
@@ -92,6 +92,8 @@ class Compared(NamedTuple):
     regulariser: Tensor | None
     """Weighted; None in steps without the term."""
     picture: Tensor
+    shown: Tensor
+    """Largest alpha of the picture."""
 
     def with_penalty(self, penalty: Tensor) -> Compared:
         """Add a penalty to the regulariser."""
@@ -176,11 +178,17 @@ def compare(
     loss, l1, ssim = photometric_loss(picture, view.truth, view.mask, config.loss.ssim, form.log_weight)
     if form.pooled:
         loss = loss + pooled_residual(picture, view.truth, view.mask)
-    recalled = recall(posed.means, alpha, l1) if binned is None else None  # else the host must not wait
-    if recalled is not None:
+    shown = alpha.detach().amax()
+    if may_recall(state) and shows_too_little(float(shown), float(l1.detach())):
+        recalled = recall(posed.means)
         regulariser = recalled if regulariser is None else regulariser + recalled
     total = loss if regulariser is None else loss + regulariser
-    return Compared(total, loss, l1, ssim, regulariser, picture)
+    return Compared(total, loss, l1, ssim, regulariser, picture, shown)
+
+
+def may_recall(state: TrainState) -> bool:
+    """Return whether the step may draw back Gaussians, for which the host waits. One of several views always may."""
+    return state.config.batch > 1 or state.recalls.holds(state.step)
 
 
 def form_of(view: View, *others: Hashable) -> Hashable:

@@ -201,6 +201,11 @@ def test_no_sanitizer_report(fake, on_gpu, place):
     assert [line.split()[:2] for line in log.read_text().splitlines()] == [["memcheck", "1"], ["racecheck", "-"]]
 
 
+def test_a_sanitizer_without_a_deadline(fake, on_gpu):
+    fake(summaries())
+    assert on_gpu("sanitizer", seconds=float("inf"))["passed"]
+
+
 @pytest.mark.parametrize(
     ("numbers", "bad"),
     [({"memory": 1, "status": 86}, "memcheck"), ({"races": 2}, "racecheck"), ({"status": 1}, "memcheck")],

@@ -178,11 +178,11 @@ def test_what_is_not_finite_is_told_and_disturbs_no_other_sphere(bad, column, de
 
 @pytest.mark.parametrize("column", range(2))
 def test_a_place_of_which_one_coordinate_is_not_a_number_is_told(column, device, silhouette):
-    """A numerator of K overflows to infinity less infinity; the other is 0."""
+    """It is infinite in the camera's frame; K multiplies it by 0 for one coordinate, and by 1 for the other."""
     camera = straight(device)
-    camera.K[column, 2] = WIDTH
+    camera.viewmat[column, column] = 2.0
+    camera.K[column, column], camera.K[1 - column, column] = 0.0, 1.0
     means = torch.full((3, 3), 0.25)
-    means[1] = torch.tensor([0.0, 0.0, -3e38])
     means[1, column] = 3e38
     value, gradient = run(silhouette, camera, [means, torch.ones(3, 2), torch.ones(2), torch.rand(20, 2)])
     assert value.isnan() and gradient[[0, 2]].isfinite().all()

@@ -110,5 +110,5 @@ def test_report(regulariser, device):
     judged(outcome, 2**40, 2**41, 0.5, None)
     term = None if regulariser is None else scalar(regulariser, device)
     scalars = [scalar(value, device) for value in (0.5, -1.5, 0.75)]
-    found = outcome.report(torch.tensor([2**40], device=device), *scalars, term)
-    assert found.tolist() == [STEP_FINE, 2**40, 0.5, -1.5, 0.75, regulariser or 0.0]
+    found = outcome.report(torch.tensor([2**40], device=device), *scalars, term, scalar(0.125, device))
+    assert found.tolist() == [STEP_FINE, 2**40, 0.5, -1.5, 0.75, regulariser or 0.0, 0.125]

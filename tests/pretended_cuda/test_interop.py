@@ -52,3 +52,23 @@ def test_all_graphs_share_one_pair_of_streams(monkeypatch):
     CudaGraph(lambda: torch.ones(3, device=CUDA), CUDA)
     monkeypatch.setattr(torch.cuda, "Stream", lambda device: pytest.fail("a new stream"))
     CudaGraph(lambda: torch.ones(4, device=CUDA), CUDA)
+
+
+def test_a_failed_capture_tells_the_cause(monkeypatch):
+    """CUDA then refuses the end of the capture as well."""
+
+    def body() -> None:
+        if torch.cuda.is_current_stream_capturing():
+            raise RuntimeError("the cause")
+
+    end = torch.cuda.CUDAGraph.capture_end
+
+    def refuse(graph: torch.cuda.CUDAGraph) -> None:
+        end(graph)
+        raise RuntimeError("CUDA error: operation failed due to a previous error during capture")
+
+    monkeypatch.setattr(torch.cuda.CUDAGraph, "capture_end", refuse)
+    with pytest.raises(RuntimeError, match="the cause"):
+        CudaGraph(body, CUDA)
+    with pytest.raises(RuntimeError, match="previous error"):
+        CudaGraph(lambda: None, CUDA)

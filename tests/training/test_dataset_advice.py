@@ -15,8 +15,8 @@ from helpers.layouts import write_colmap, write_poses_bounds
 from helpers.tiny import tiny_dataset, write_dnerf
 from scgs_warp.config.presets import MOTIONS, PRESETS, preset, with_steps
 from scgs_warp.data import Dataset, load
+from scgs_warp.training.automatic import resolve_auto
 from scgs_warp.training.dataset_advice import Survey, advise, looks_away, survey
-from scgs_warp.training.state import resolve_auto
 
 
 def lines(data: Dataset, **changes) -> tuple[str, str]:

@@ -17,6 +17,7 @@ from scgs_warp.config.presets import preset
 from scgs_warp.geometry.cameras import scaled_camera
 from scgs_warp.rendering.render import render
 from scgs_warp.training import flow as module
+from scgs_warp.training.automatic import resolve_auto
 from scgs_warp.training.flow import (
     SPANS,
     FlowNumbers,
@@ -28,7 +29,6 @@ from scgs_warp.training.flow import (
     measured,
 )
 from scgs_warp.training.loop import fit
-from scgs_warp.training.state import resolve_auto
 from scgs_warp.types import Camera, Frame, Gaussians, Splats
 
 

@@ -10,10 +10,11 @@ import torch
 from helpers.tiny import tiny_config, tiny_dataset
 from scgs_warp.geometry.normalisation import COMMON_RADIUS, Normalisation
 from scgs_warp.training import density_control
+from scgs_warp.training.automatic import resolve_auto
 from scgs_warp.training.density_control import visible_gaussians
 from scgs_warp.training.frames import Frames
 from scgs_warp.training.near_bound import nearest_content
-from scgs_warp.training.state import TrainState, resolve_auto
+from scgs_warp.training.state import TrainState
 
 
 def filled(count: int = 6):

@@ -14,11 +14,11 @@ from scgs_warp.errors import UserError
 from scgs_warp.evaluation.run_time import read_seconds, training_seconds
 from scgs_warp.scene.scene import Scene
 from scgs_warp.storage import checkpoint
+from scgs_warp.training.automatic import resolve_auto
 from scgs_warp.training.loop import fit
 from scgs_warp.training.preflight import CHOSEN_BY_THE_DATA, in_use, refuse_early
 from scgs_warp.training.resuming import check_same_configuration
 from scgs_warp.training.run_folder import RunFolder
-from scgs_warp.training.state import resolve_auto
 
 
 @pytest.fixture(scope="module")

@@ -19,9 +19,10 @@ from scgs_warp.data.dataset import Dataset
 from scgs_warp.errors import FrameError, UserError
 from scgs_warp.evaluation.image_metrics import psnr
 from scgs_warp.training import loop, second_config, second_try
+from scgs_warp.training.automatic import resolve_auto
 from scgs_warp.training.loop import fit
 from scgs_warp.training.second_config import may_be_tried_again
-from scgs_warp.training.state import TrainState, resolve_auto
+from scgs_warp.training.state import TrainState
 
 CONFIG = tiny_config(40, pretrain={"steps": 12, "densify_until": 8, "warm_up": 2, "progressive_every": 1})
 
@@ -50,7 +51,7 @@ def test_the_choice_is_made_before_the_first_step(monkeypatch):
     config, data = tiny_config(500, pretrain={"steps": 20 * 6}), tiny_dataset(6)
     assert config.pretrain.arap_by == "auto"
     assert resolve_auto(config, data).pretrain.arap_by == "auto"
-    monkeypatch.setattr("scgs_warp.training.state.is_thin", lambda data: True)
+    monkeypatch.setattr("scgs_warp.training.automatic.is_thin", lambda data: True)
     assert resolve_auto(config, data).pretrain.arap_by == "track"
     by_moment = dataclasses.replace(config, pretrain=dataclasses.replace(config.pretrain, arap_by="moment"))
     assert resolve_auto(by_moment, data).pretrain.arap_by == "moment", "what is asked for stays"

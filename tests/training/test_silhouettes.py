@@ -15,10 +15,11 @@ from scgs_warp.config.presets import from_dict, preset, to_dict
 from scgs_warp.data.dataset import Dataset
 from scgs_warp.ops.pooled import pooled_residual
 from scgs_warp.training import silhouettes
+from scgs_warp.training.automatic import resolve_auto
 from scgs_warp.training.frames import Frames
 from scgs_warp.training.pretrain import initial_gaussians, initial_spheres
 from scgs_warp.training.silhouettes import Silhouettes, silhouette_of, silhouette_term
-from scgs_warp.training.state import TrainState, resolve_auto
+from scgs_warp.training.state import TrainState
 from scgs_warp.training.step import training_step
 from scgs_warp.types import Camera, Frame
 

@@ -13,9 +13,10 @@ from scgs_warp.errors import UserError
 from scgs_warp.geometry.normalisation import FEWEST_POINTS
 from scgs_warp.scene.scene import Scene
 from scgs_warp.storage import checkpoint
+from scgs_warp.training.automatic import has_initial_points, resolve_auto
 from scgs_warp.training.initial_points import HALF_SIZE
 from scgs_warp.training.loop import fit
-from scgs_warp.training.state import TrainState, has_initial_points, resolve_auto
+from scgs_warp.training.state import TrainState
 from scgs_warp.types import Camera
 
 
