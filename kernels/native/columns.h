@@ -39,6 +39,12 @@ ALWAYS_INLINE void write_vectors(void* data, int begin, int rows, int width, con
     __builtin_memcpy((float*)data + (long long)begin * width, a, rows == 16 ? 64 * width : 4 * width * rows);
 }
 
+// Prefetch the rows of the next block: a thread's blocks follow one another.
+ALWAYS_INLINE void prefetch_next(const float* data, int begin, int width) {
+    const float* next = data + (begin + 16ll) * width;
+    for (int line = 0; line < width; ++line) __builtin_prefetch(next + 16 * line);
+}
+
 // Read 16 columns, from column `from` on, of the rows of an array of `size` floats. Lanes past the last row are zeros;
 // columns past the width hold whatever follows.
 ALWAYS_INLINE void read_columns(const float* data, long long size, int begin, int rows, int width, int from, vf* to) {

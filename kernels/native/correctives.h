@@ -30,6 +30,7 @@ ALWAYS_INLINE Turns read_turns(
 ALWAYS_INLINE void read_matrix(const wp::array_t<float>& correctives, int begin, int rows, vf* C) {
     const long long size = 27ll * correctives.shape[0];
     vf right[16];
+    prefetch_next(correctives.data, begin, 27);
     read_columns(correctives.data, size, begin, rows, 27, 0, C);
     read_columns(correctives.data, size, begin, rows, 27, 11, right);
     for (int k = 5; k < 16; ++k) C[11 + k] = right[k];
