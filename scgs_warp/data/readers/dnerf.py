@@ -18,7 +18,8 @@ from ..choice import Choice, choose, choose_instants, of_cameras, present
 from ..dataset import Dataset
 from ..held_out import held_out
 from ..images import ReadOptions
-from .transforms import find_image, find_mask, read_distortion, read_lens, read_pose, read_times, read_transforms
+from .transforms import find_mask, read_distortion, read_lens, read_pose, read_times, read_transforms
+from .transforms_images import find_images
 
 
 def transforms_path(folder: Path, split: str) -> Path:
@@ -46,7 +47,8 @@ def read(folder: Path, split: str, options: ReadOptions) -> Dataset:
     times = read_times(path, entries)
     if not shared and split != "train":
         _check_times(folder, path, entries)
-    files = [find_image(path, folder, index, entry) for index, entry in enumerate(entries)]
+    located = find_images(path, folder, entries)
+    entries, files = located.entries, located.files
     if options.only_cameras:
         of_cameras([""] * len(files), options)
     if shared or split == "train":
@@ -63,7 +65,7 @@ def read(folder: Path, split: str, options: ReadOptions) -> Dataset:
         mask = find_mask(path, folder, index, entries[index])
         frame = (files[index], poses[index], choice.times[index], lens, files[index].stem, mask)
         records.append(FrameRecord(*frame, states_size=states_size))
-    return assemble(records, options, folder=folder, split=split, one_size=True, notes=choice.notes)
+    return assemble(records, options, folder=folder, split=split, one_size=True, notes=[*located.notes, *choice.notes])
 
 
 def _path(folder: Path, split: str) -> tuple[Path, bool]:

@@ -28,7 +28,8 @@ from ..held_out import held_out
 from ..images import ReadOptions
 from ..natural_order import by_name
 from ..points import read_points
-from .transforms import find_image, find_mask, read_distortion, read_lens, read_pose, read_times, read_transforms
+from .transforms import find_mask, read_distortion, read_lens, read_pose, read_times, read_transforms
+from .transforms_images import find_images
 
 FILE = "transforms.json"
 
@@ -51,8 +52,8 @@ def read(folder: Path, split: str, options: ReadOptions) -> Dataset:
     """
     path = folder / FILE
     content = read_transforms(path)
-    entries = content["frames"]
-    files = [find_image(path, folder, index, entry) for index, entry in enumerate(entries)]
+    located = find_images(path, folder, content["frames"])
+    entries, files = located.entries, located.files
     times = _times(path, entries, files)
     for entry in entries:
         read_distortion(path, {**content, **entry})
@@ -63,10 +64,11 @@ def read(folder: Path, split: str, options: ReadOptions) -> Dataset:
     if offset is not None:
         poses = {index: moved(pose, offset) for index, pose in poses.items()}
     records = [
-        _record(path, folder, content, index, files[index], poses[index], choice.times[index]) for index in chosen
+        _record(path, folder, {**content, "frames": entries}, index, files[index], poses[index], choice.times[index])
+        for index in chosen
     ]
     border = video_border([files[index] for index in choice.indices], [times[index] for index in choice.indices])
-    notes = [*choice.notes, *([] if offset is None else [note(offset)]), *_of_depth(path, content)]
+    notes = [*located.notes, *choice.notes, *([] if offset is None else [note(offset)]), *_of_depth(path, content)]
     data = assemble(records, options, folder=folder, split=split, one_size=True, border=border, notes=notes)
     return with_points(data, *_points(path, folder, content, data.cameras, np.zeros(3) if offset is None else offset))
 

@@ -6,8 +6,6 @@ Poses are camera-to-world, OpenGL (x right, y up, z backward), as NeRF's Blender
 from __future__ import annotations
 
 import math
-import os
-import re
 from pathlib import Path
 from typing import Any
 
@@ -87,41 +85,6 @@ def read_times(path: Path, entries: list[dict[str, Any]]) -> list[float]:
             raise UserError(f"{where} is {time:g}, outside [0, 1]; {remedy}")
         times.append(time)
     return times
-
-
-def find_image(path: Path, folder: Path, index: int, entry: dict[str, Any]) -> Path:
-    """Find the frame's image file; complete a name that lacks its suffix."""
-    name = entry.get("file_path")
-    if not isinstance(name, str) or not name:
-        raise UserError(f"{path}: frames[{index}].file_path is missing or not text; name the image file")
-    where = f"{path}: frames[{index}].file_path"
-    if is_foreign(name):
-        raise UserError(f"{where} is {name[:60]!r}, a path of another machine; write it relative to {folder}")
-    base = inside(folder, name, where, "image")
-    if base.is_file():
-        return base
-    names = [base.name] if base.suffix.lower() in SUFFIXES else [base.name + suffix for suffix in SUFFIXES]
-    candidates = [base.with_name(name) for name in names]
-    return next((found for found in map(in_any_case, candidates) if found is not None), candidates[0])
-
-
-def is_foreign(name: str) -> bool:
-    """Return whether a name is an absolute path of Windows, or one that does not exist here."""
-    return re.match(r"[A-Za-z]:[/\\]", name) is not None or (name.startswith("/") and not Path(name).exists())
-
-
-def in_any_case(file: Path) -> Path | None:
-    """Return the file, or the one in its folder whose name differs only in upper and lower case; None without either.
-    Windows and macOS ignore the case of names, so data sets made there may mix it."""
-    if file.is_file():
-        return file
-    wanted = file.name.lower()
-    try:
-        with os.scandir(file.parent) as entries:
-            found = sorted(entry.name for entry in entries if entry.name.lower() == wanted)
-    except OSError:
-        return None
-    return file.with_name(found[0]) if found and file.with_name(found[0]).is_file() else None
 
 
 def find_mask(path: Path, folder: Path, index: int, entry: dict[str, Any]) -> Path | None:

@@ -1,0 +1,107 @@
+"""Files of the images that ``transforms*.json`` names."""
+
+from __future__ import annotations
+
+import os
+import re
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from ...errors import UserError
+from ...storage.safe_paths import inside
+from ..moved_images import Move, find_move, parts_of
+from .colmap_images import reduced_folders
+from .transforms import SUFFIXES
+
+
+class FrameFiles(NamedTuple):
+    files: list[Path]
+    """File of each frame's image; it need not exist."""
+    entries: list[dict[str, Any]]
+    """Entries of ``frames``; names of masks and depth maps have moved with the images."""
+    notes: tuple[str, ...]
+    """Lines that the user should read."""
+
+
+def find_images(path: Path, folder: Path, entries: list[dict[str, Any]]) -> FrameFiles:
+    """Find the frames' images. If none is where it should be, as after a move to another machine, they are looked for
+    below ``folder`` (:func:`find_move`).
+
+    Raises:
+        UserError: a name is no text, or leads out of the folder.
+    """
+    names = [entry.get("file_path") for entry in entries]
+    for index, name in enumerate(names):
+        if not isinstance(name, str) or not name:
+            raise UserError(f"{path}: frames[{index}].file_path is missing or not text; name the image file")
+    if not any(_existing(folder, name) for name in names):
+        moved = _moved(path, folder, entries)
+        if moved is not None:
+            return moved
+    return FrameFiles([_find_image(path, folder, index, name) for index, name in enumerate(names)], entries, ())
+
+
+def _moved(path: Path, folder: Path, entries: list[dict[str, Any]]) -> FrameFiles | None:
+    """Return the images that are at another place than their names say; None without them."""
+    names = [entry["file_path"] for entry in entries]
+    moved = find_move(names, lambda name: _existing(folder, name), [each.name for each in reduced_folders(folder)])
+    if moved is None:
+        return None
+    move, found = moved
+    expected = [file or folder / (move.of(name) or "images") for file, name in zip(found, names)]
+    first = next(index for index, file in enumerate(found) if file is not None)
+    line = f"{path}: {names[first][:60]!r} is not there; images are taken from {expected[first].parent}"
+    return FrameFiles(expected, [_with_moved_maps(entry, move) for entry in entries], (line,))
+
+
+def _with_moved_maps(entry: dict[str, Any], move: Move) -> dict[str, Any]:
+    """Drop from the names of a frame's mask and depth map the folders that its image's name has lost."""
+    lost, moved = parts_of(entry["file_path"])[: move.dropped], dict(entry)
+    for key in ("mask_path", "depth_file_path"):
+        if isinstance(entry.get(key), str) and parts_of(entry[key])[: move.dropped] == lost:
+            moved[key] = "/".join(parts_of(entry[key])[move.dropped :])
+    return moved
+
+
+def _find_image(path: Path, folder: Path, index: int, name: str) -> Path:
+    """Find the frame's image file; complete a name that lacks its suffix."""
+    where = f"{path}: frames[{index}].file_path"
+    if is_foreign(name):
+        raise UserError(f"{where} is {name[:60]!r}, a path of another machine; write it relative to {folder}")
+    return _completed(inside(folder, name, where, "image"))
+
+
+def _existing(folder: Path, name: str) -> Path | None:
+    """Return the image of a name below ``folder``; None if there is none."""
+    try:
+        file = _completed(inside(folder, name, ""))
+    except UserError:
+        return None
+    return file if file.is_file() else None
+
+
+def _completed(base: Path) -> Path:
+    if base.is_file():
+        return base
+    names = [base.name] if base.suffix.lower() in SUFFIXES else [base.name + suffix for suffix in SUFFIXES]
+    candidates = [base.with_name(name) for name in names]
+    return next((found for found in map(in_any_case, candidates) if found is not None), candidates[0])
+
+
+def is_foreign(name: str) -> bool:
+    """Return whether a name is an absolute path of Windows, or one that does not exist here."""
+    return re.match(r"[A-Za-z]:[/\\]", name) is not None or (name.startswith("/") and not Path(name).exists())
+
+
+def in_any_case(file: Path) -> Path | None:
+    """Return the file, or the one in its folder whose name differs only in upper and lower case; None without either.
+    Windows and macOS ignore the case of names, so data sets made there may mix it."""
+    if file.is_file():
+        return file
+    wanted = file.name.lower()
+    try:
+        with os.scandir(file.parent) as entries:
+            found = sorted(entry.name for entry in entries if entry.name.lower() == wanted)
+    except OSError:
+        return None
+    return file.with_name(found[0]) if found and file.with_name(found[0]).is_file() else None
