@@ -17,7 +17,7 @@ from ..errors import UserError
 from . import skeleton_file
 from .document import Edit, Film, Shot, View, film_fields, ordered_views, shot_fields, view_fields
 from .engine import Engine
-from .field_reader import FieldReader, one_line, read_object, show_value
+from .field_reader import FieldReader, one_line, read_object, show_value, whole_number
 from .handles import Handle, Target, handle_fields
 from .keyframes import Keyframe, keyframe_fields
 from .part_skin import SkinName
@@ -118,9 +118,10 @@ def parse(content: Any, source: str, engine: Engine, default: Callable[[], Skele
     root = FieldReader(content, source)
     if root.raw("format") != FORMAT:
         raise root.wrong("format", f"is {show_value(root.raw('format'))}", f'an edit has "format": "{FORMAT}"')
-    version = root.raw("version")
-    if isinstance(version, bool) or not isinstance(version, int) or not 1 <= version <= VERSION:
-        raise root.wrong("version", f"is {show_value(version)}", f"this program reads versions 1 to {VERSION}")
+    version = whole_number(root.raw("version"))
+    if version is None or not 1 <= version <= VERSION:
+        what = f"is {show_value(root.raw('version'))}"
+        raise root.wrong("version", what, f"this program reads versions 1 to {VERSION}")
     _check_scene(root, engine)
     handles: list[Handle] = []
     own = root.child("skeleton")
@@ -178,11 +179,7 @@ def _nodes(fields: FieldReader, name: str, engine: Engine, *, time: float = 0.0)
         return _region(FieldReader(value, fields.source, f"{fields.path}.{name}".strip(".")), engine, time)
     if value is None or not isinstance(value, list) or not value:
         raise fields.wrong(name, "is missing or empty", "list control points, or say a place: point, sphere or box")
-    last = len(engine.graph) - 1
-    for index in value:
-        if isinstance(index, bool) or not isinstance(index, int) or not 0 <= index <= last:
-            raise fields.wrong(name, f"names control point {show_value(index)}", f"give whole numbers from 0 to {last}")
-    return tuple(sorted(set(value)))
+    return fields.indices(name, count=len(engine.graph))
 
 
 def _region(region: FieldReader, engine: Engine, time: float) -> tuple[int, ...]:

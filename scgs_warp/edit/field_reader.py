@@ -121,9 +121,10 @@ class FieldReader:
         value = self.raw(name)
         if value is None:
             return default
-        if isinstance(value, bool) or not isinstance(value, int) or not low <= value <= high:
+        whole = whole_number(value)
+        if whole is None or not low <= whole <= high:
             raise self.wrong(name, f"is {show_value(value)}", f"give a whole number from {low} to {high}")
-        return value
+        return whole
 
     def boolean(self, name: str) -> bool | None:
         value = self.raw(name)
@@ -174,15 +175,23 @@ class FieldReader:
             raise self.wrong(name, f"is {show_value(value)}", f"give a list of at most {most}")
         return value
 
-    def indices(self, name: str, least: int = 0) -> tuple[int, ...]:
-        """Return whole numbers from 0 on, at least ``least`` of them, ascending; the scene says which exist."""
+    def indices(self, name: str, least: int = 0, count: int | None = None) -> tuple[int, ...]:
+        """Return whole numbers from 0 on, at least ``least`` of them, ascending.
+
+        Args:
+            count: number of control points; without it, the scene says which exist.
+        """
         value = self.items(name)
         if len(value) < least:
             raise self.wrong(name, "is missing or empty", "list control points")
-        for index in value:
-            if isinstance(index, bool) or not isinstance(index, int) or index < 0:
-                raise self.wrong(name, f"names control point {show_value(index)}", "give whole numbers from 0 on")
-        return tuple(sorted(set(value)))
+        found = set()
+        for item in value:
+            index = whole_number(item)
+            if index is None or index < 0 or (count is not None and index >= count):
+                known = "on" if count is None else f"to {count - 1}"
+                raise self.wrong(name, f"names control point {show_value(item)}", f"give whole numbers from 0 {known}")
+            found.add(index)
+        return tuple(sorted(found))
 
     def records(self, name: str, kind: type[Record]) -> tuple[Record, ...]:
         """Return records that a caller has made, which check their own fields."""
@@ -276,6 +285,11 @@ def _is_number(value: Any) -> bool:
         return math.isfinite(float(value))
     except OverflowError:
         return False
+
+
+def whole_number(value: Any) -> int | None:
+    """Return a whole number, which some languages write as 1.0; None if the value is none."""
+    return int(value) if _is_number(value) and value == int(value) else None
 
 
 def show_value(value: Any) -> str:

@@ -40,18 +40,12 @@ def from_fields(fields: FieldReader, count: int) -> Skeleton:
 
 
 def _part(fields: FieldReader, count: int) -> Part:
-    nodes = fields.items("nodes")
-    for node in nodes:
-        if isinstance(node, bool) or not isinstance(node, int) or not 0 <= node < count:
-            raise fields.wrong(
-                "nodes", f"names control point {show_value(node)}", f"give whole numbers from 0 to {count - 1}"
-            )
     joint, axis = fields.vector("joint", 3), fields.vector("axis", 3)
     if joint is None:
         raise fields.wrong("joint", "is missing", "give 3 numbers")
     part = Part(
         name=fields.text("name"),
-        nodes=tuple(sorted(nodes)),
+        nodes=fields.indices("nodes", count=count),
         parent=fields.text_or_none("parent"),
         joint=joint,
         axis=None if axis is None else unit_axis(axis, fields),

@@ -163,7 +163,8 @@ def _grids(course: Course) -> Grids:
     origin = course.means.min(axis=(0, 1)).astype(np.float64)
     if np.ptp(course.means, axis=(0, 1)).max() / step > FARTHEST:
         raise UserError(
-            "--format 4dgs: a Gaussian is too far away for the format; train with --set densify.prune_large=on"
+            "--format 4dgs: a Gaussian is too far away for the format; move it less far if an edit put it there, or "
+            "train with --set densify.prune_large=on"
         )
     life = min(max(float(course.seconds[-1]), 0.02), 2.0)
     finer = min(max(int(np.ceil(np.log2(life / 0.5))), -4), 2)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from helpers.edit_scenes import bar_scene
-from scgs_warp.edit import EditSession, edit_file, skeleton_file
+from scgs_warp.edit import EditSession, Hold, edit_file, skeleton_file
 from scgs_warp.errors import UserError
 from scgs_warp.scene.from_gaussians import with_control_points
 
@@ -127,3 +127,30 @@ def test_a_part_is_turned_in_files_of_every_version(session):
     for version in (1, 2):
         edit = edit_file.parse({**content, "version": version}, "the file", session.engine, lambda: session.skeleton)
         assert {handle.turns for handle in edit.handles} == {None}
+
+
+def test_whole_numbers_may_be_written_as_other_languages_do(session, tmp_path):
+    session.add_handle([3, 4], time=0.0, name="hand")
+    session.pin([7])
+    session.turn("shoulder_left", 45, (0, 1, 0))
+    session.add_keyframe(1.0)
+    session.apply(dataclasses.replace(session.edit, holds=(Hold((5,), 0.5),)))
+    session.save(tmp_path / "edit.json")
+
+    def spelt(value):
+        if isinstance(value, dict):
+            return {name: spelt(item) for name, item in value.items()}
+        if isinstance(value, list):
+            return [spelt(item) for item in value]
+        return float(value) if isinstance(value, int) and not isinstance(value, bool) else value
+
+    content = spelt(json.loads((tmp_path / "edit.json").read_text()))
+    assert content["version"] == 2.0 and isinstance(content["skeleton"]["parts"][0]["nodes"][0], float)
+    (tmp_path / "other.json").write_text(json.dumps(content))
+    other = session.fork()
+    other.load(tmp_path / "other.json")
+    assert other.edit == session.edit
+    content["film"]["size"] = 400.5
+    (tmp_path / "other.json").write_text(json.dumps(content))
+    with pytest.raises(UserError, match=r"film.size is 400.5; give a whole number"):
+        other.load(tmp_path / "other.json")

@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from helpers.edit_scenes import bar_scene, tinted_scene
+from scgs_warp.edit import EditSession
 from scgs_warp.errors import UserError
 from scgs_warp.export import segments as parts
 from scgs_warp.export.moving import export_fourdgs
@@ -130,3 +131,12 @@ def test_the_same_scene_gives_the_same_bytes_and_faults_are_told(tmp_path):
     assert (tmp_path / "a.4dgs").read_bytes() == (tmp_path / "b.4dgs").read_bytes()
     with pytest.raises(UserError, match="--frames 2"):
         export_fourdgs(tmp_path / "c.4dgs", scene, None, even_moments(1, FPS), usable)
+
+
+def test_a_gaussian_that_an_edit_moved_too_far_asks_for_less_of_the_edit(tmp_path):
+    session = EditSession(bar_scene(nodes=12, gaussians=60))
+    session.add_handle([0, 1, 2], time=0.0, name="end")
+    session.pin_rest(1)
+    session.move("end", translation=(1e8, 0.0, 0.0))
+    with pytest.raises(UserError, match="too far away for the format; move it less far if an edit put it there"):
+        export_fourdgs(tmp_path / "a.4dgs", session.scene, session, even_moments(2, FPS), everything(session.scene))
