@@ -28,7 +28,7 @@ from mutation_table import mutation_table
 from provenance import ROOT, without_older_marks
 from quality_tables import WRITERS, quality_table, reported_table
 from repeatable_tables import REPEATABLE, repeatable_table
-from timing_tables import BENCHMARKS, speed_overview, timing_table
+from timing_tables import BENCHMARKS, speed_overview, speed_ratios, timing_table
 
 RESULTS = ROOT / "benchmarks" / "results"
 MARKED = re.compile(r"(<!-- table: (\S+) -->\n).*?(<!-- /table -->)", re.DOTALL)
@@ -40,6 +40,7 @@ def table_names(results: Path) -> list[str]:
     return [
         *BENCHMARKS,
         "speed-overview",
+        "speed-ratios",
         *KERNELS,
         *FORMATS,
         *(f"quality-{name}" for name in WRITERS),
@@ -63,6 +64,8 @@ def section(name: str, results: Path) -> str:
         return gpu_table(results)
     if name == "speed-overview":
         return speed_overview(results)
+    if name == "speed-ratios":
+        return speed_ratios(results)
     if name in KERNELS:
         return kernel_table(name, results)
     if name in FORMATS:

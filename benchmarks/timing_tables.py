@@ -194,6 +194,34 @@ def speed_overview(results: Path) -> str:
     return "\n\n".join(part for part in (table(["", "1 thread", "2 threads"], lines), older_note(older)) if part)
 
 
+def one_thread_ratio(report: Report, key: str) -> float | None:
+    """Return a ratio of speeds on one thread; of a report on motion models, that of ``control-points``."""
+    if "ratios" in report:
+        return report["ratios"][key]
+    rows = report.get("table_s2") or report["motion"]
+    return next(row[key] for row in rows if row["motion"] == "control-points" and row["threads"] == 1)
+
+
+def speed_ratios(results: Path) -> str:
+    """Write how many times as fast one thread is as that of others; cells stay empty where a result is missing."""
+    lines, older = [], []
+    for text, name, key in (
+        ("rasterising, forward, beside OpenSplat's CPU rasteriser", "opensplat", "forward"),
+        ("rasterising, forward and all gradients, beside OpenSplat's CPU rasteriser", "opensplat", "both"),
+        ("a whole dynamic frame beside that of a static scene", "frame-cpu", "ratio_to_static"),
+        ("a frame with poses kept and interpolated, beside that of a static scene", "playback-cpu", "ratio_to_static"),
+        ("a whole dynamic frame beside that of `per-gaussian`", "table-s2-cpu", "ratio_to_per_gaussian"),
+    ):
+        path = results / f"{name}.json"
+        report = json.loads(path.read_text(encoding="utf-8")) if path.is_file() else None
+        if report and changed_since(report["commit"], BENCHMARKS[name].measures):
+            text = f"{text} {OLDER}"
+            older.append(report["commit"])
+        lines.append([text, number(report and one_thread_ratio(report, key), 2)])
+    head = ["on one thread", "times as fast"]
+    return "\n\n".join(part for part in (table(head, lines), older_note(older)) if part)
+
+
 class Benchmark(NamedTuple):
     """Writer of a table of timings, and the source of its results."""
 

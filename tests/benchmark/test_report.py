@@ -38,7 +38,8 @@ def test_the_pages_show_what_the_results_give(report):
 
 
 @pytest.mark.parametrize(
-    "name", ["quality-published", "quality-published-nerf-ds", "frame-cpu", "speed-overview", "page-precision"]
+    "name",
+    ["quality-published", "quality-published-nerf-ds", "frame-cpu", "speed-overview", "speed-ratios", "page-precision"],
 )
 def test_a_changed_figure_is_found(report, tmp_path, capsys, name):
     copies = []
