@@ -147,6 +147,10 @@ def main(args: list[str] | None) -> None:
         if group:
             say(group.summary())
         say(f"{output}: metrics.json, contact_sheet.png, curves.png, turntable.mp4")
+        if first:
+            say(f"next: python apps/view.py --run {output} --mode time --output film.mp4")
+            if config.motion.model in ("control-points", "static"):
+                say(f"to edit: python apps/edit.py --run {output}")
 
 
 def cli(args: list[str] | None = None) -> int:

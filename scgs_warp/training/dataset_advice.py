@@ -13,7 +13,7 @@ from itertools import pairwise
 import numpy as np
 import torch
 
-from ..config.presets import TrainConfig
+from ..config.presets import TrainConfig, preset
 from ..data.dataset import Dataset, spread
 from ..geometry.normalisation import FEWEST_POINTS, Normalisation
 from ..types import Frame
@@ -217,7 +217,7 @@ def _brightness(frame: Frame, on_white: bool) -> float:
 
 def advise(facts: Survey, config: TrainConfig, device: str = "cpu") -> tuple[str, str]:
     """Write two lines: the data's properties; the expected result and the most useful setting."""
-    cameras = f"one camera, {facts.turn:.0f} degrees from frame to frame"
+    cameras = f"one camera, {facts.turn:.1f} degrees from frame to frame"
     locked = facts.frames == facts.views * facts.instants
     if facts.views > 1 and (locked or not facts.standing):
         cameras = f"{facts.views} views of each instant"
@@ -301,7 +301,7 @@ def progressive_without_effect(config: TrainConfig, frames: int, points: int) ->
 def _help(facts: Survey, config: TrainConfig, device: str) -> str:
     """Name the setting that improves the result most, or one that was asked for and has no effect."""
     without_effect = progressive_without_effect(config, facts.frames, facts.points)
-    if without_effect is not None:
+    if without_effect is not None and not preset(config.preset).pretrain.progressive:
         return without_effect
     if facts.instants < 2 and config.motion.model != "static":
         return "--motion static is all it needs"

@@ -264,7 +264,9 @@ def curves(log_path: str | Path, out_png: str | Path) -> None:
                 axes.plot(list(points), list(points.values()), style, label=label, markersize=3, linewidth=1.2)
         drawn = len(axes.lines)
         if title == "loss" and any(np.max(line.get_ydata()) > 0 for line in axes.lines):
-            axes.set_yscale("log")
+            axes.set_yscale("log", nonpositive="mask")
+            if any(np.min(line.get_ydata()) < 0 for line in axes.lines):  # It has a logarithm (``loss.log_error``).
+                axes.set_title("loss, where it is positive")
         for _, start in starts[1:]:
             axes.axvline(start, color="0.6", linestyle=":", linewidth=1)
         if drawn and len(series) > 1:

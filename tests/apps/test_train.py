@@ -48,7 +48,9 @@ def test_the_default_output_is_named_after_what_the_configuration_names(trained,
     for file in (trained / "config.json", tmp_path / "part.json"):
         done = run_app("train", "--config", str(file), "--steps", "20", *SMALL)
         assert done.returncode == 0, done.stderr
-        assert f"runs/blobs-{content['preset']}: metrics.json" in done.stderr + done.stdout
+        run = f"runs/blobs-{content['preset']}"
+        assert f"{run}: metrics.json" in done.stdout
+        assert f"next: python apps/view.py --run {run} " in done.stdout
         shutil.rmtree("runs")
 
 

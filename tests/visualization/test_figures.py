@@ -150,3 +150,16 @@ def test_contact_sheet_shows_alpha_where_there_is_any() -> None:
     assert colors == [[255, 0, 0], [255, 255, 255], [0, 0, 255], [0, 0, 0]], "missing, both, extra, neither"
     assert (sheet[top + 86 : top + 146, left : left + 80] == 255).all(), "the second row has none"
     assert figures.contact_sheet([(picture, picture)], alphas=[None]).shape[1] == 3 * 84 + 4
+
+
+def test_the_curve_of_a_loss_ends_where_it_turns_negative(tmp_path: Path, monkeypatch) -> None:
+    """With the logarithm of the error in it: a fall to the edge of the panel would look like a defect."""
+    from matplotlib.axes import Axes
+
+    scales, titles = [], []
+    monkeypatch.setattr(Axes, "set_yscale", lambda axes, value, **options: scales.append(options["nonpositive"]))
+    monkeypatch.setattr(Axes, "set_title", lambda axes, text: titles.append(text))
+    lines = [{"step": step, "stage": "main", "loss": 0.1 - step / 1000} for step in (50, 99, 101)]
+    write_log(tmp_path / "log.jsonl", lines)
+    figures.curves(tmp_path / "log.jsonl", tmp_path / "curves.png")
+    assert scales == ["mask"] and "loss, where it is positive" in titles
