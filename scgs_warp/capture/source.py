@@ -18,6 +18,7 @@ from ..data.natural_order import natural
 from ..errors import UserError
 from .completeness import Incomplete, header_of, incomplete, lost_in_gaps
 from .frame_times import REORDERED, rising
+from .high_dynamic_range import is_high_dynamic_range, to_standard
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
 DIGEST_BYTES = 1 << 20
@@ -198,15 +199,30 @@ def _lacks_times(container: Any, stream: Any) -> bool:
 
 
 def _picture(frame: Any, longest: int, shape: float) -> np.ndarray:
-    """Return a decoded frame as displayed: upright, and with square pixels made from pixels ``shape`` times as wide as
-    high."""
+    """Return a decoded frame as displayed: upright, in sRGB, and with square pixels made from pixels ``shape`` times as
+    wide as high."""
     width, height = frame.width * shape, frame.height
     scale = min(1.0, longest / max(width, height))
-    image = frame.to_ndarray(format="rgb24")
+    rich = is_high_dynamic_range(frame.color_trc)
+    image = frame.to_ndarray(format="rgb48le" if rich else "rgb24")
+    if frame.interlaced_frame:
+        image = _one_field(image)
     size = max(1, round(width * scale)), max(1, round(height * scale))
     if size != (frame.width, frame.height):
         image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+    if rich:
+        image = to_standard(image, frame.color_trc)
     return rotate_image(image, getattr(frame, "rotation", 0) or 0)
+
+
+def _one_field(image: np.ndarray) -> np.ndarray:
+    """Replace every other row of an interlaced picture, which was recorded at another moment, by those beside it."""
+    image = image.copy()
+    own, other = image[0::2], image[1::2]
+    between = len(own) - 1
+    other[:] = own[: len(other)]
+    other[:between] = cv2.addWeighted(own[:-1], 0.5, own[1:], 0.5, 0.0)
+    return image
 
 
 def rotate_image(image: np.ndarray, degrees: float) -> np.ndarray:

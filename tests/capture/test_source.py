@@ -38,6 +38,24 @@ def test_pixels_are_made_square(tmp_path):
     assert {still.image.shape for still in Video(tmp_path / "film.mp4").frames(1000)} == {(120, 192, 3)}
 
 
+def test_the_fields_of_interlaced_films_are_not_mixed(tmp_path):
+    import av
+
+    early, late = pan([0, 12], 120, 144)
+    mixed = early.copy()
+    mixed[1::2] = late[1::2]
+    with av.open(str(tmp_path / "film.mkv"), "w") as container:
+        stream = container.add_stream("libx264", rate=25)
+        stream.width, stream.height, stream.pix_fmt = 144, 120, "yuv444p"
+        stream.options = {"x264-params": "interlaced=1:tff=1:qp=4"}
+        container.mux(stream.encode(av.VideoFrame.from_ndarray(mixed, format="rgb24")))
+        container.mux(stream.encode())
+    (still,) = Video(tmp_path / "film.mkv").frames(1000)
+    off = np.abs(still.image.astype(int) - early).mean((1, 2))
+    assert np.abs(late.astype(int) - early).mean() > 10
+    assert off[0::2].max() < 3 and off[1::2].max() < 8
+
+
 def test_a_film_that_changes_its_size_is_usable_up_to_there(tmp_path):
     (tmp_path / "call.h264").write_bytes(stream(pan(range(0, 60, 3), 120, 144)) + stream(pan(range(9), 60, 80)))
     seen = []
