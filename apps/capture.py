@@ -35,7 +35,7 @@ class Options:
     """Camera of a rig that is held out for evaluation; the first by default."""
     lens: Literal["auto", "shared", "each"] = "auto"
     """Lenses of a rig. shared: all cameras have the same; each: every camera has its own; auto: shared if all videos
-    have one size."""
+    have one size, unless lenses of their own fit clearly better."""
     frames: int | None = None
     """Largest number of frames to pick: the sharpest, spread over time and motion. By default 150 of a video and all of
     a folder. For a rig, number of instants, 150 at most by default."""

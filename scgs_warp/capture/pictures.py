@@ -43,13 +43,13 @@ def sheet(
     count = len(captions)
     shown = spread(count, MAX_PICTURES)
     cells = [_cell(*load(k), _caption(captions[k], k in registered), k in registered) for k in shown]
-    height, width = cells[0].shape[:2]
+    height, width = max(len(cell) for cell in cells), CELL  # cameras of a rig may be held upright or not
     columns = min(COLUMNS, len(cells))
     rows = -(-len(cells) // columns)
     canvas = np.full((GAP + rows * (height + GAP), GAP + columns * (width + GAP), 3), 255, np.uint8)
     for position, cell in enumerate(cells):
         top, left = GAP + position // columns * (height + GAP), GAP + position % columns * (width + GAP)
-        canvas[top : top + height, left : left + width] = cell
+        canvas[top : top + len(cell), left : left + width] = cell
     write_png(path, canvas)
 
 

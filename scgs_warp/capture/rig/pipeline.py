@@ -22,7 +22,7 @@ from ..features import FrameFiles
 from ..journal import Journal, disk_errors
 from ..source import Video, read_rgb
 from ..writing import FILE
-from . import adjustment, cameras, still, synchronisation
+from . import adjustment, cameras, own_lenses, still, synchronisation
 from .instants import Recorded, TimeLine, recorded, time_line
 from .neural_video import POSES, KnownCameras, known_cameras, write_neural_video
 from .points import points_at
@@ -96,6 +96,7 @@ def _capture(rig: _Rig, known: KnownCameras | None) -> RigResult:
         raise UserError(f"--held-out {held_out}: its pose was not found; hold out another camera")
     lines = [rig.describe(line), rig.describe_clock(starts)]
     lines += [f"note: {', '.join(missing)} shares too little with the others and is left out"] if missing else []
+    lines += own_lenses.describe_lenses(solved) if request.lens == "auto" else []
     lines += [*rig.cut_off(), *rig.unadjusted(), *rig.unsteady()]
     if not before:
         extra = rig.points(solved.cameras)
@@ -265,16 +266,18 @@ class _Rig:
             with self.show(len(chosen), "matching") as bar:
                 features.match(database, stills, chosen, request.seed, self.device, bar.advance)
 
+        def solve_cameras() -> int:
+            found = cameras.solve(database, stills, model, request.seed)
+            if shared and request.lens == "auto":
+                lens = (request.camera_model, focal)
+                own_lenses.prefer_own_lenses(database, stills, model, *lens, request.seed, self.device)
+            return found
+
         settings = [request.camera_model, request.fov, request.features, shared]
         self.journal.stage("features", settings, find, lambda: remove_database(database))
         self.journal.stage("matches", request.seed, compare, lambda: features.forget(database))
         with self.show(1, "cameras") as bar:
-            self.journal.stage(
-                "cameras",
-                request.seed,
-                lambda: cameras.solve(database, stills, model, request.seed),
-                lambda: shutil.rmtree(model, ignore_errors=True),
-            )
+            self.journal.stage("cameras", request.seed, solve_cameras, lambda: shutil.rmtree(model, ignore_errors=True))
             bar.advance()
         # Captures that earlier versions finished have no adjusted cameras.
         if model.is_dir() and (self.journal.knows("adjustment") or not self.journal.finished):

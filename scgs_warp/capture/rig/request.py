@@ -32,7 +32,8 @@ class RigRequest:
     size: int = 1280
     """Largest size of the longer side of the images, pixels."""
     lens: Literal["auto", "shared", "each"] = "auto"
-    """``shared``: one lens for all cameras; ``each``: its own for each; ``auto``: shared if sizes are equal."""
+    """``shared``: one lens for all cameras; ``each``: its own for each; ``auto``: shared if sizes are equal,
+    unless lenses of their own fit clearly better."""
     camera_model: CameraModel = "SIMPLE_RADIAL"
     fov: float | None = None
     """Horizontal field of view, degrees; None if unknown."""
