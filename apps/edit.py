@@ -42,7 +42,7 @@ class Options:
     motion: Path | None = None
     """Motion to play on the scene's parts as keyframes: a run folder, or a glTF character (.glb, .gltf)."""
     clip: str | None = None
-    """Name of the animation of --motion; the first one by default."""
+    """Name of the animation of --motion; the first one that moves by default."""
     match: Path | None = None
     """JSON object that names, for parts of the scene, those of --motion; by default those of the same name."""
     nodes: int | None = None

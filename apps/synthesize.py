@@ -67,7 +67,7 @@ class Options(FilmOptions, Output):
     """Built-in subject instead of a file: robot (the default), rods, rods-dark, balls, balls-steady, cloth, fan,
     touch, opening, still."""
     clip: str | None = None
-    """Name of the animation; the first one by default. With an unknown name, the command lists all names."""
+    """Name of the animation; the first one that moves by default. With an unknown name, the command lists all names."""
     start: float | None = None
     """Second of the clip that becomes time 0; its first keyframe by default."""
     end: float | None = None

@@ -16,6 +16,8 @@ from .file import GltfFile
 PATHS = {"translation": 3, "rotation": 4, "scale": 3}
 """Number of components of each animated property; ``weights`` has one per morph target of the mesh."""
 POINTER = "KHR_animation_pointer"
+STILL = 1e-5
+"""Change of a property, as a share of its largest value, that counts as rounding."""
 POINTED = re.compile(r"/nodes/([0-9]{1,9})/(translation|rotation|scale|weights)")
 """Pointers of that extension to what channels without it move as well."""
 
@@ -24,11 +26,17 @@ class Sampler(NamedTuple):
     """A curve through the keyframes of one property."""
 
     times: np.ndarray
-    """[N] seconds, increasing."""
+    """[N] seconds, not falling."""
     values: np.ndarray
     """[N, C]; for a cubic spline [N, 3, C]: in-tangent, value, out-tangent."""
     interpolation: str
     """LINEAR, STEP or CUBICSPLINE."""
+
+    @property
+    def moves(self) -> bool:
+        """True if the value changes; tangents alone count for nothing."""
+        keys = self.values[:, 1] if self.interpolation == "CUBICSPLINE" else self.values
+        return bool((np.ptp(keys, axis=0) > STILL * np.abs(keys).max()).any())
 
 
 class Channel(NamedTuple):
@@ -46,6 +54,11 @@ class Clip(NamedTuple):
     """Time of the last keyframe, seconds."""
     ignored: int = 0
     """Number of channels that move something else than nodes and weights."""
+
+    @property
+    def moves(self) -> bool:
+        """True if a value changes between two keyframes."""
+        return any(channel.sampler.moves for channel in self.channels)
 
 
 def slerp(a: np.ndarray, b: np.ndarray, share: float) -> np.ndarray:
@@ -135,8 +148,8 @@ def _sampler(file: GltfFile, sampler: Any, path: str, where: str) -> Sampler:
         raise file.error(where, f"is interpolated by {str(interpolation)[:30]}; use LINEAR, STEP or CUBICSPLINE")
     times = file.array(sampler.input, f"{where} input", 1)[:, 0].astype(np.float64)
     values = file.array(sampler.output, f"{where} output", PATHS.get(path)).astype(np.float64)
-    if not len(times) or (np.diff(times) <= 0).any():
-        raise file.error(where, "has keyframe times that do not increase; export the animation again")
+    if not len(times) or (np.diff(times) < 0).any():  # Equal times, which some exporters write, are a jump.
+        raise file.error(where, "has keyframe times that fall; export the animation again")
     parts = 3 if interpolation == "CUBICSPLINE" else 1
     rows = len(times) * parts
     if len(values) < rows or (path == "weights" and len(values) % rows) or (path in PATHS and len(values) != rows):
@@ -146,7 +159,8 @@ def _sampler(file: GltfFile, sampler: Any, path: str, where: str) -> Sampler:
 
 
 def choose_clip(file: GltfFile, clips: list[Clip], name: str | None) -> Clip | None:
-    """Choose the clip with the given name, ignoring case if no name matches exactly; without a name, the first clip.
+    """Choose the clip with the given name, ignoring case if no name matches exactly; without a name, the first one that
+    moves something, because files often begin with a pose at rest.
 
     Returns:
         The clip; None for a file without animations.
@@ -155,7 +169,7 @@ def choose_clip(file: GltfFile, clips: list[Clip], name: str | None) -> Clip | N
         UserError: there is no such clip; the message lists the clips.
     """
     if name is None:
-        return clips[0] if clips else None
+        return next((clip for clip in clips if clip.moves), clips[0] if clips else None)
     if not clips:
         raise UserError(f"--clip {name}: {file.path} holds no animation; leave out --clip")
     matching = [clip for clip in clips if clip.name == name]

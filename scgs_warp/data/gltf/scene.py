@@ -123,7 +123,7 @@ def read_scene(path: str | Path, clip: str | None = None) -> GltfScene:
 
     Args:
         path: .glb or .gltf.
-        clip: name of an animation; None: the first one.
+        clip: name of an animation; None: the first one that moves something.
 
     Raises:
         UserError: the file is invalid, or the clip unknown; one line names the field and the remedy, or the clips.

@@ -40,7 +40,7 @@ class SynthesisRequest:
     mesh: Path | None = None
     """A glTF file; None: a built-in subject."""
     clip: str | None = None
-    """Name of the clip; None: the file's first."""
+    """Name of the clip; None: the file's first one that moves."""
     start: float | None = None
     """Time of the clip, in seconds, that becomes time 0; None: its first keyframe."""
     end: float | None = None
@@ -194,6 +194,8 @@ def describe(scene: GltfScene, span: tuple[float, float]) -> list[str]:
             lines.append(f"{scene.clip.ignored} of its channels move neither nodes nor weights, and are left out")
         if span[0] == span[1]:
             lines.append("the clip has no length: nothing will move; choose another with --clip")
+        elif not scene.clip.moves:
+            lines.append("no value changes in the clip: nothing will move; choose another with --clip")
     if scene.skipped:
         lines.append(f"{scene.skipped} sets of points or lines are left out")
     return lines

@@ -305,6 +305,34 @@ def test_clips_by_name(tmp_path):
         read(quad(), tmp_path, "Run")
 
 
+def test_the_first_clip_that_moves_is_taken(tmp_path):
+    glb = box()
+    slide = glb.document["animations"].pop()
+    glb.clip("T-Pose")
+    glb.animate(glb.clip("RESET"), 1, "scale", [0.0], [[2, 2, 2]])
+    glb.animate(glb.clip("Rest"), 1, "translation", [0.0, 1.0], [[1, 2, 3], [1, 2, 3]])
+    glb.document["animations"].append(slide)
+    scene = read(glb, tmp_path)
+    assert scene.clip is not None and scene.clip.name == "Slide"
+    rest = read(glb, tmp_path, "rest")
+    assert any("nothing will move" in line for line in describe(rest, (0.0, 1.0)))
+    glb.document["animations"].pop()
+    still = read(glb, tmp_path)
+    assert still.clip is not None and still.clip.name == "T-Pose"
+
+
+def test_two_keyframes_at_one_time_are_a_jump(tmp_path):
+    glb = box()
+    times, places = [0.0, 1.0, 1.0, 2.0], [[0, 0, 0], [1, 0, 0], [5, 0, 0], [6, 0, 0]]
+    glb.animate(glb.clip("Jump"), 1, "translation", times, places)
+    scene = read(glb, tmp_path, "Jump")
+    seen = [scene.nodes.world(scene.clip, second)[1, 0, 3] for second in (0.5, 0.999, 1.0, 1.5)]
+    np.testing.assert_allclose(seen, [0.5, 0.999, 5.0, 5.5])
+    glb.animate(glb.clip("Back"), 1, "translation", [0.0, 1.0, 0.5], places[:3])
+    with pytest.raises(UserError, match="keyframe times that fall"):
+        read(glb, tmp_path, "Jump")
+
+
 def test_texture_transform_moves_coordinates(tmp_path):
     glb = quad(np.zeros((2, 2, 3), np.uint8))
     info = glb.document["materials"][0]["pbrMetallicRoughness"]["baseColorTexture"]
