@@ -114,7 +114,9 @@ def _refuse_empty_paths(words: Sequence[str], *kinds: type) -> None:
     """Refuse empty names of files and folders, as of a variable that a script has not set: ``Path`` would take them for
     the current folder."""
     parts = [part for word in words for part in (word.split("=", 1) if word.startswith("--") else [word])]
-    for option, value in pairwise(parts):
+    for option, value in pairwise(["", *parts]):
+        if not option.startswith("--") and not value.strip():
+            raise UserError("an empty name is given; name a file or folder, or leave it out")
         if option.startswith("--") and not value.strip() and "Path" in _hint(option, *kinds):
             raise UserError(f"{option}: is followed by an empty name; name a file or folder, or leave {option} out")
 

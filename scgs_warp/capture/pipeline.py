@@ -118,6 +118,8 @@ def check(request: CaptureRequest) -> None:
     start, end = request.start or 0.0, math.inf if request.end is None else request.end
     if not 0.0 <= start < end:
         raise UserError(f"--start {start:g} --end {end:g}: give two seconds of the video, the earlier one as --start")
+    if not request.masks.strip():
+        raise UserError("--masks: is followed by an empty name; give auto, none, a folder or a video")
     if request.keep == "moving" and request.masks in ("auto", "none"):
         raise UserError(
             "--keep-static off: needs masks of the whole mover, black where it is; give --masks DIR or --masks "
@@ -349,6 +351,7 @@ def _share(journal: Journal) -> float:
 def _lines(request: CaptureRequest, frames: PickedFrames, outcome: Outcome) -> list[str]:
     left_out = f" ({frames.blurred} blurred, {frames.alike} alike)" if frames.blurred or frames.alike else ""
     missing = [] if frames.incomplete is None else [f"note: {request.source}: {frames.incomplete.describe()}"]
+    missing += left_out(request.source) if request.source.is_dir() else []
     return [
         f"{outcome.picked} of {frames.seen} frames picked{left_out}, {frames.size[0]} x {frames.size[1]}; "
         f"{100 * outcome.masked:.0f} % of their pixels move; {outcome.links.features} features a frame",

@@ -14,13 +14,12 @@ import numpy as np
 
 from ..data.images import is_complete, oversized_claim, size_text
 from ..data.name_times import moments_in_names
-from ..data.natural_order import natural
 from ..errors import UserError
 from .completeness import Incomplete, header_of, incomplete, lost_in_gaps
+from .folder_content import images_in
 from .frame_times import REORDERED, rising
 from .high_dynamic_range import is_high_dynamic_range, to_standard
 
-SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
 DIGEST_BYTES = 1 << 20
 """Number of bytes of a file that are hashed at a time. Digests of earlier versions saw as many at both ends only."""
 LONGEST = 1000
@@ -242,12 +241,8 @@ class Folder:
             UserError: the folder holds no images.
         """
         self.path = path
-        found = [file for file in path.iterdir() if file.suffix.lower() in SUFFIXES and file.is_file()]
-        files = [file for file in found if is_shown(file)]
-        self.files = sorted(files, key=lambda file: natural(file.name))
-        self.count = len(files)
-        if not files:
-            raise UserError(f"{path}: holds no images ({', '.join(SUFFIXES)}); give the folder that does, or a video")
+        self.files = images_in(path)
+        self.count = len(self.files)
         self.moments = _moments([file.name for file in self.files])
 
     def frames(self, longest: int) -> Iterator[SourceFrame]:
@@ -276,11 +271,6 @@ def _moments(names: list[str]) -> list[float]:
     if moments is None or steps[0] <= 0 or sum(steps) > LONGEST * len(names) * steps[len(steps) // 2]:
         return [float(index) for index in range(len(names))]
     return [float((moment - moments[0]) / steps[len(steps) // 2]) for moment in moments]
-
-
-def is_shown(file: Path) -> bool:
-    """Return whether a file is none that macOS hides beside each file (``._1.png``) on disks of other systems."""
-    return not file.name.startswith("._")
 
 
 def read_rgb(file: Path) -> np.ndarray:

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from helpers.films import encoded, mask_images, pan, stream
+from scgs_warp.capture.folder_content import left_out
 from scgs_warp.capture.source import DIGEST_BYTES, Folder, Video, open_source, rotate_image
 from scgs_warp.errors import UserError
 from scgs_warp.visualization.video import film, write_png
@@ -92,6 +93,37 @@ def test_what_is_no_film_is_refused(tmp_path):
     (mixed / "010.png").write_bytes(b"x")
     with pytest.raises(UserError, match=r"010\.png: is not an image"):
         list(open_source(mixed).frames(64))
+
+
+def test_files_that_are_hidden_are_no_images(tmp_path):
+    for name in ("1.png", "2.png", ".trashed-1700-3.png"):
+        write_png(tmp_path / name, np.zeros((8, 8, 3), np.uint8))
+    (tmp_path / "._1.png").write_bytes(b"\0\5\x16\7")
+    assert [file.name for file in Folder(tmp_path).files] == ["1.png", "2.png"]
+
+
+def test_folders_without_images_say_what_they_hold(tmp_path):
+    for name, files, said in (
+        ("phone", ["IMG_1.HEIC", "IMG_2.HEIC"], r"holds 2 photographs in other formats \(\.heic\), .*as JPEG"),
+        ("film", ["clip.mp4"], r"give \S+clip\.mp4$"),
+        ("rig", ["a.mp4", "b.MOV"], r"give \S+a\.mp4, or --rig \S+rig for films"),
+        ("scene", ["images/1.png"], r"but images does; give \S+images$"),
+    ):
+        for file in files:
+            (tmp_path / name / file).parent.mkdir(parents=True, exist_ok=True)
+            (tmp_path / name / file).write_bytes(b"x")
+        with pytest.raises(UserError, match=said):
+            Folder(tmp_path / name)
+
+
+def test_photographs_in_other_formats_are_counted(tmp_path):
+    for name in ("1.jpg", "1.dng", "2.HEIC", "3.heic"):
+        (tmp_path / name).write_bytes(b"x")
+    (note,) = left_out(tmp_path)
+    assert "2 photographs in other formats (.heic) are left out" in note
+    (tmp_path / "2.HEIC").unlink()
+    (tmp_path / "3.heic").unlink()
+    assert left_out(tmp_path) == []
 
 
 def test_what_identifies_a_source_covers_whole_files(tmp_path):

@@ -33,7 +33,7 @@ from ...data.natural_order import natural
 from ...errors import UserError
 from ...storage.exr_files import INSTALL, read_exr, reads_exr
 from ...storage.json_files import as_number, read_json
-from ..source import is_shown
+from ..folder_content import is_shown
 from .monst3r import quaternion_matrix
 from .scene import ImportedFrame, ImportedScene, from_arkit, intrinsics, rigid
 

@@ -1,0 +1,68 @@
+"""What folders hold instead of images, or beside them: films, folders, and photographs in formats that are not read."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+
+from ..data.natural_order import natural
+from ..data.unknown import VIDEOS
+from ..errors import UserError
+
+SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
+UNREAD = (".heic", ".heif", ".hif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2")
+"""Suffixes of photographs in formats of phones and cameras that are not read."""
+MOST_FOLDERS = 200
+"""Number of folders in which images are looked for."""
+
+
+def is_shown(file: Path) -> bool:
+    """Return whether a file is none that systems hide: ``._1.png``, which macOS puts beside each file on disks of other
+    systems, and ``.trashed-1.jpg``, which Android keeps for a while."""
+    return not file.name.startswith(".")
+
+
+def files_in(folder: Path, suffixes: Sequence[str]) -> list[Path]:
+    """Return the files that are not hidden and have one of the suffixes, in the natural order of their names."""
+    found = [file for file in folder.iterdir() if file.suffix.lower() in suffixes and is_shown(file) and file.is_file()]
+    return sorted(found, key=lambda file: natural(file.name))
+
+
+def images_in(folder: Path) -> list[Path]:
+    """Return the images of a folder.
+
+    Raises:
+        UserError: it holds none; the message names what it holds instead.
+    """
+    files = files_in(folder, SUFFIXES)
+    if files:
+        return files
+    unread, films = files_in(folder, UNREAD), files_in(folder, VIDEOS)
+    below = next((inner for inner in _folders(folder) if files_in(inner, SUFFIXES)), None)
+    if unread:
+        raise UserError(f"{folder}: holds {_counted(unread)}, which cannot be read; save them as JPEG")
+    if films:
+        more = f", or --rig {folder} for films of one rig" if len(films) > 1 else ""
+        raise UserError(f"{folder}: holds no images, but {films[0].name}; give {films[0]}{more}")
+    if below is not None:
+        raise UserError(f"{folder}: holds no images, but {below.name} does; give {below}")
+    raise UserError(f"{folder}: holds no images ({', '.join(SUFFIXES)}); give the folder that does, or a video")
+
+
+def left_out(folder: Path) -> list[str]:
+    """Name the photographs of a folder that are left out, because their formats are not read; those of which there is
+    an image as well do not count."""
+    images = {file.stem for file in files_in(folder, SUFFIXES)}
+    unread = [file for file in files_in(folder, UNREAD) if file.stem not in images]
+    return [f"note: {folder}: {_counted(unread)} are left out; save them as JPEG, too"] if unread else []
+
+
+def _folders(folder: Path) -> list[Path]:
+    found = [inner for inner in folder.iterdir() if is_shown(inner) and inner.is_dir()]
+    return sorted(found, key=lambda inner: natural(inner.name))[:MOST_FOLDERS]
+
+
+def _counted(files: Sequence[Path]) -> str:
+    kinds = Counter(file.suffix.lower() for file in files)
+    return f"{len(files)} photographs in other formats ({', '.join(kinds)})"
