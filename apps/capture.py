@@ -11,6 +11,7 @@ import tyro
 
 from scgs_warp.apps.arguments import parse
 from scgs_warp.apps.cli import Device, prepare, run
+from scgs_warp.errors import shell_words
 
 
 @dataclass(frozen=True)
@@ -98,7 +99,7 @@ def main(args: list[str] | None) -> None:
         _capture_rig(options, options.rig, device)
     elif options.poses is not None:
         further = _import_scene(options, options.poses)
-    print(f"next: python apps/train.py --data {options.output}{further}")
+    print(f"next: python apps/train.py --data {shell_words(options.output)}{further}")
 
 
 def _capture_video(options: Options, video: Path, device: str) -> None:

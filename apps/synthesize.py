@@ -9,6 +9,7 @@ from typing import Literal
 
 from scgs_warp.apps.arguments import parse, refuse_given
 from scgs_warp.apps.cli import Device, prepare, run
+from scgs_warp.errors import shell_words
 
 
 @dataclass(frozen=True)
@@ -178,7 +179,7 @@ def _render(options: Options, device: str) -> None:
     pictures = ", ".join(f"{count} {split}" for split, count in planned.counts.items())
     files = ", ".join([*planned.truth_files, SHEET])
     print(f"{o.output}: {pictures}; {files}{' (made before)' if planned.made else ''}")
-    print(f"next: python apps/train.py --data {o.output}")
+    print(f"next: python apps/train.py --data {shell_words(o.output)}")
 
 
 def _film(options: Options, kind: Literal["phone", "rig"], device: str) -> None:
@@ -199,10 +200,11 @@ def _film(options: Options, kind: Literal["phone", "rig"], device: str) -> None:
             make_film(plan, bar.advance)
     files = ", ".join(take.file for take in plan.shooting.takes)
     print(f"{o.output}: {files}, truth.npz{' (made before)' if plan.made else ''}")
-    source = f"--rig {o.output}" if kind == "rig" else o.output / plan.shooting.takes[0].file
-    print(f"next: python apps/capture.py {source} --output {o.output}-captured")
+    folder = str(o.output)
+    source = ["--rig", folder] if kind == "rig" else [str(o.output / plan.shooting.takes[0].file)]
+    print(f"next: python apps/capture.py {shell_words(*source, '--output', f'{folder}-captured')}")
     if kind == "phone":
-        print(f"with the true cameras: python apps/train.py --data {o.output}")
+        print(f"with the true cameras: python apps/train.py --data {shell_words(folder)}")
 
 
 def cli(args: list[str] | None = None) -> int:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import shlex
+
 MAX_MESSAGE = 1000
 """Largest length of a message, limited because names and reasons in it may come from any file."""
 
@@ -47,3 +50,11 @@ def is_shortage(error: BaseException) -> bool:
         return True
     texts = [str(error), str(error.__cause__ or "")]
     return any(words in text for words in SHORTAGE for text in texts)
+
+
+def shell_words(*words: object) -> str:
+    """Return words, as paths, as they are written in a shell, for the commands in messages."""
+    texts = [str(word) for word in words]
+    if os.name == "nt":  # whose shells take quotes of another kind
+        return " ".join(f'"{text}"' if " " in text else text for text in texts)
+    return shlex.join(texts)

@@ -7,7 +7,7 @@ import os
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from ..errors import UserError
+from ..errors import UserError, shell_words
 from .readers.transforms import SUFFIXES as IMAGES
 
 VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".gif")
@@ -31,17 +31,19 @@ def not_a_folder(path: Path) -> UserError:
         )
     if suffix in VIDEOS:
         return UserError(
-            f"{path}: a video has no cameras yet; find them with: scgs-warp capture {path} --output data/{path.stem}"
+            f"{path}: a video has no cameras yet; find them with: scgs-warp capture {shell_words(path)} --output "
+            f"{shell_words(f'data/{path.stem}')}"
         )
     if suffix in ARCHIVES:
         return UserError(f"{path}: is an archive; unpack it and give the folder that it makes")
     if suffix in SPLATS:
         return UserError(
-            f"{path}: holds Gaussians or points, not images; to see a file of Gaussians: scgs-warp view --ply {path} "
+            f"{path}: holds Gaussians or points, not images; to see a file of Gaussians: scgs-warp view --ply "
+            f"{shell_words(path)} "
             "--output film.mp4"
         )
     if suffix == ".json" or path.name == "poses_bounds.npy":
-        return UserError(f"{path}: is a file of a data set; give its folder: --data {path.parent}")
+        return UserError(f"{path}: is a file of a data set; give its folder: --data {shell_words(path.parent)}")
     if suffix in IMAGES:
         return UserError(f"{path}: is one image; give the folder of a data set (docs/data.md lists the layouts)")
     return UserError(f"{path}: is a file; give the folder of a data set (docs/data.md lists the layouts)")
@@ -63,14 +65,14 @@ def no_layout(folder: Path, recognised: Callable[[Path], bool]) -> UserError:
         return UserError(f"{folder}: is empty; give the folder of a data set (docs/data.md lists the layouts)")
     for inner in _below(folder):
         if recognised(inner):
-            return UserError(f"{folder}: the data set is in a folder below; give --data {inner}")
+            return UserError(f"{folder}: the data set is in a folder below; give --data {shell_words(inner)}")
     above = next((outer for outer in list(folder.parents)[:2] if recognised(outer)), None)
     if above is not None:
-        return UserError(f"{folder}: is a part of a data set; give its folder: --data {above}")
+        return UserError(f"{folder}: is a part of a data set; give its folder: --data {shell_words(above)}")
     if sum(entry.suffix.lower() in IMAGES for entry in entries) >= FEWEST_PHOTOS:
         return UserError(
-            f"{folder}: holds images without cameras; find them with: scgs-warp capture {folder} --output "
-            f"data/{folder.resolve().name}-cameras"
+            f"{folder}: holds images without cameras; find them with: scgs-warp capture {shell_words(folder)} --output "
+            f"{shell_words(f'data/{folder.resolve().name}-cameras')}"
         )
     film = next((entry for entry in entries if entry.suffix.lower() in VIDEOS), None)
     if film is not None:

@@ -37,6 +37,12 @@ def test_files(name, expected, tmp_path):
     assert expected.format(path=path) in said(path)
 
 
+def test_commands_can_be_copied_to_a_shell(tmp_path):
+    path = tmp_path / "my film.mp4"
+    path.write_bytes(b"")
+    assert f"scgs-warp capture '{path}' --output 'data/my film'" in said(path)
+
+
 def test_a_mistyped_name(tmp_path):
     (tmp_path / "garden").mkdir()
     assert said(tmp_path / "graden").endswith(f"no such folder; did you mean {tmp_path / 'garden'}?")
