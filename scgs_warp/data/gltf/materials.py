@@ -82,6 +82,9 @@ def read_materials(file: GltfFile) -> tuple[list[Material], list[Texture]]:
         glossy = extensions.get("KHR_materials_pbrSpecularGlossiness")
         if isinstance(glossy, dict):
             factor, info = glossy.get("diffuseFactor"), glossy.get("diffuseTexture")
+        shines = _shines_only(factor, material)
+        if shines:  # as programs export what shall look the same in any light
+            factor, info = [*material.emissiveFactor, factor[3]], material.emissiveTexture
         coordinates, transform = _placing(info)
         materials.append(
             Material(
@@ -92,10 +95,17 @@ def read_materials(file: GltfFile) -> tuple[list[Material], list[Texture]]:
                 alpha_mode=ALPHA_MODES.get(material.alphaMode or "OPAQUE", OPAQUE),
                 cutoff=0.5 if material.alphaCutoff is None else float(material.alphaCutoff),
                 double_sided=bool(material.doubleSided),
-                unlit="KHR_materials_unlit" in extensions,
+                unlit=shines or "KHR_materials_unlit" in extensions,
             )
         )
     return [*materials, Material(double_sided=True)], textures
+
+
+def _shines_only(factor: Any, material: Any) -> bool:
+    """Return whether a material has no colour but that of its emission."""
+    emission = material.emissiveFactor
+    dark = isinstance(factor, list) and len(factor) == 4 and not any(factor[:3])
+    return dark and isinstance(emission, list) and len(emission) == 3 and any(value > 0 for value in emission)
 
 
 def _field(info: Any, name: str) -> Any:

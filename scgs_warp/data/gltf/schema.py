@@ -60,6 +60,7 @@ FIELDS: dict[str, Any] = {
     "textures": [{"source": INT, "sampler": INT, "extensions": {"*": {"source": INT}}}],
     "materials": [
         {"pbrMetallicRoughness": {"baseColorFactor": [NUMBER], "baseColorTexture": {**_TEXTURE, "": ("index",)}},
+         "emissiveFactor": [NUMBER], "emissiveTexture": {**_TEXTURE, "": ("index",)},
          "alphaMode": TEXT, "alphaCutoff": NUMBER, "doubleSided": FLAG,
          "extensions": {"KHR_materials_pbrSpecularGlossiness": _GLOSSY}}
     ],

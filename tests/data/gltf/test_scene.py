@@ -333,6 +333,18 @@ def test_two_keyframes_at_one_time_are_a_jump(tmp_path):
         read(glb, tmp_path, "Jump")
 
 
+def test_a_black_material_that_shines_has_the_colour_of_its_emission(tmp_path):
+    """As programs export materials without shading."""
+    glb = quad(np.full((2, 2, 3), 90, np.uint8), pbr={"baseColorFactor": [0, 0, 0, 0.5]}, emissiveFactor=[1, 1, 0.5])
+    material = glb.document["materials"][0]
+    material["emissiveTexture"] = material["pbrMetallicRoughness"].pop("baseColorTexture")
+    found = read(glb, tmp_path).materials[0]
+    assert found.factor == (1.0, 1.0, 0.5, 0.5) and found.texture == 0 and found.unlit
+    material["pbrMetallicRoughness"]["baseColorFactor"] = [0.1, 0, 0, 1]
+    lit = read(glb, tmp_path).materials[0]
+    assert lit.factor == (0.1, 0.0, 0.0, 1.0) and lit.texture == -1 and not lit.unlit
+
+
 def test_texture_transform_moves_coordinates(tmp_path):
     glb = quad(np.zeros((2, 2, 3), np.uint8))
     info = glb.document["materials"][0]["pbrMetallicRoughness"]["baseColorTexture"]
