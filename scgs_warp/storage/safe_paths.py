@@ -48,6 +48,20 @@ def _fits(text: str) -> bool:
     return size <= LONGEST_PATH and all(len(os.fsencode(part)) <= LONGEST_NAME for part in text.split("/"))
 
 
+def in_any_case(file: Path) -> Path | None:
+    """Return the file, or the one in its folder whose name differs only in upper and lower case; None without either.
+    Windows and macOS ignore the case of names, so data sets made there may mix it."""
+    if file.is_file():
+        return file
+    wanted = file.name.lower()
+    try:
+        with os.scandir(file.parent) as entries:
+            found = sorted(entry.name for entry in entries if entry.name.lower() == wanted)
+    except OSError:
+        return None
+    return file.with_name(found[0]) if found and file.with_name(found[0]).is_file() else None
+
+
 def is_regular(path: Path) -> bool:
     """Return whether ``path`` is a regular file, not a folder, pipe or device.
 

@@ -22,7 +22,7 @@ import numpy as np
 from ...errors import UserError
 from ...storage.files import open_regular, read_bytes
 from ...storage.json_files import parse_json
-from ...storage.safe_paths import inside
+from ...storage.safe_paths import in_any_case, inside
 from ..images import is_complete, oversized_claim
 from .schema import find_problem
 
@@ -175,6 +175,7 @@ class GltfFile:
             except (binascii.Error, ValueError):
                 raise self.error(field, "is no valid base64; export the file again") from None
         path = inside(self.path.parent, unquote(uri), f"{self.path}: {field}")
+        path = in_any_case(path) or path
         try:
             with open_regular(path) as file:
                 data = file.read()

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import os
 import re
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from ...errors import UserError
-from ...storage.safe_paths import inside
+from ...storage.safe_paths import in_any_case, inside
 from ..moved_images import Move, find_move, parts_of
 from .colmap_images import reduced_folders
 from .transforms import SUFFIXES
@@ -91,17 +90,3 @@ def _completed(base: Path) -> Path:
 def is_foreign(name: str) -> bool:
     """Return whether a name is an absolute path of Windows, or one that does not exist here."""
     return re.match(r"[A-Za-z]:[/\\]", name) is not None or (name.startswith("/") and not Path(name).exists())
-
-
-def in_any_case(file: Path) -> Path | None:
-    """Return the file, or the one in its folder whose name differs only in upper and lower case; None without either.
-    Windows and macOS ignore the case of names, so data sets made there may mix it."""
-    if file.is_file():
-        return file
-    wanted = file.name.lower()
-    try:
-        with os.scandir(file.parent) as entries:
-            found = sorted(entry.name for entry in entries if entry.name.lower() == wanted)
-    except OSError:
-        return None
-    return file.with_name(found[0]) if found and file.with_name(found[0]).is_file() else None

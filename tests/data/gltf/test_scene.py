@@ -291,6 +291,18 @@ def test_separate_and_embedded_buffers(tmp_path):
     assert read_scene(tmp_path / "beside.gltf").digest != before
 
 
+def test_files_beside_may_differ_in_case(tmp_path):
+    glb = quad(np.full((2, 2, 3), 90, np.uint8))
+    view = glb.document["bufferViews"][glb.document["images"][0].pop("bufferView")]
+    start = view["byteOffset"]
+    (tmp_path / "Skin.PNG").write_bytes(glb.binary[start : start + view["byteLength"]])
+    (tmp_path / "Mesh.bin").write_bytes(glb.binary)
+    glb.document["images"][0] = {"uri": "skin.png"}
+    glb.document["buffers"] = [{"byteLength": len(glb.binary), "uri": "mesh.BIN"}]
+    (tmp_path / "scene.gltf").write_text(json.dumps(glb.document))
+    assert (read_scene(tmp_path / "scene.gltf").textures[0].pixels[..., :3] == 90).all()
+
+
 def test_clips_by_name(tmp_path):
     glb = box()
     glb.clip("Walk")
