@@ -92,7 +92,7 @@ class Video:
         self.path = path
         self.incomplete: Incomplete | None = None
         with self._opened() as container:
-            stream = container.streams.video[0]
+            stream = main_pictures(container)
             rate = float(stream.average_rate or 30)
             seconds = float(container.duration or 0) / 1e6
             self.count = int(stream.frames) or max(1, round(seconds * rate))
@@ -120,7 +120,7 @@ class Video:
         """Yield all frames in order, or only the ``wanted`` ones by their index; the others are not converted."""
         self.incomplete, read = None, _Read()
         with self._opened() as container:
-            stream = container.streams.video[0]
+            stream = main_pictures(container)
             stream.thread_type = "SLICE"  # Threads of frames lose more or fewer of those before a damaged one.
             shape = float(stream.sample_aspect_ratio or 1)
             size, last, times = None, 0.0, array("d")
@@ -153,6 +153,11 @@ class Video:
 
     def digest(self, earlier: bool = False) -> str:
         return _digest_of_ends([self.path]) if earlier else _digest([self.path])
+
+
+def main_pictures(container: Any) -> Any:
+    """Return the stream of pictures that players show, which a cover or a preview may precede."""
+    return container.streams.best("video") or container.streams.video[0]
 
 
 class _Read:

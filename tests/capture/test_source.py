@@ -10,6 +10,7 @@ import pytest
 
 from helpers.films import encoded, mask_images, pan, stream
 from scgs_warp.capture.folder_content import left_out
+from scgs_warp.capture.rig.instants import frame_seconds
 from scgs_warp.capture.source import DIGEST_BYTES, Folder, Video, open_source, rotate_image
 from scgs_warp.errors import UserError
 from scgs_warp.visualization.video import film, write_png
@@ -55,6 +56,23 @@ def test_the_fields_of_interlaced_films_are_not_mixed(tmp_path):
     off = np.abs(still.image.astype(int) - early).mean((1, 2))
     assert np.abs(late.astype(int) - early).mean() > 10
     assert off[0::2].max() < 3 and off[1::2].max() < 8
+
+
+def test_a_cover_before_the_film_is_passed_over(tmp_path):
+    import av
+
+    pictures = pan(range(0, 60, 3), 120, 144)
+    with av.open(str(tmp_path / "film.mkv"), "w") as container:
+        cover, film_of_it = container.add_stream("mjpeg", rate=10), container.add_stream("libx264", rate=10)
+        for stream, kind in ((cover, "yuvj420p"), (film_of_it, "yuv420p")):
+            stream.width, stream.height, stream.pix_fmt = 144, 120, kind
+        container.mux(cover.encode(av.VideoFrame.from_ndarray(pictures[0], format="rgb24")))
+        for picture in pictures:
+            container.mux(film_of_it.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")))
+        for stream in (cover, film_of_it):
+            container.mux(stream.encode())
+    assert len(list(Video(tmp_path / "film.mkv").frames(200))) == 20
+    assert len(frame_seconds(tmp_path / "film.mkv")) == 20
 
 
 def test_a_film_that_changes_its_size_is_usable_up_to_there(tmp_path):

@@ -6,12 +6,13 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from ...errors import UserError
 from ..completeness import Incomplete, header_of, incomplete, lost_in_gaps
+from ..source import main_pictures
 
 SAME_MOMENT = 0.08
 """Difference from an instant, as a share of the time between two frames, that is attributed to the error of the
@@ -78,7 +79,7 @@ def recorded(path: Path) -> Recorded:
         with av.open(str(path)) as container:
             if not container.streams.video:
                 raise UserError(f"{path}: holds no pictures; take it out of the folder")
-            stream: Any = container.streams.video[0]
+            stream = main_pictures(container)
             rate = float(stream.average_rate or 30)
             header, hidden, packets = header_of(container, stream), 0, []
             for packet in container.demux(stream):
@@ -117,7 +118,7 @@ def _first_stamp(path: Path) -> int | None:
     from av.error import FFmpegError
 
     with av.open(str(path)) as container:
-        for packet in container.demux(video=0):
+        for packet in container.demux(main_pictures(container)):
             try:
                 for frame in packet.decode():
                     return frame.pts

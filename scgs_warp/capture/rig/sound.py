@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ...errors import UserError
+from ..source import main_pictures
 
 RATE = 16_000
 """Samples per second at which sound is compared."""
@@ -69,6 +70,6 @@ def _first_second(container: Any) -> float:
     """Return the time of the first video frame on the container's clock."""
     if not container.streams.video:
         return 0.0
-    for frame in container.decode(video=0):
+    for frame in container.decode(main_pictures(container)):
         return float(frame.time) if frame.time is not None else 0.0
     return 0.0
