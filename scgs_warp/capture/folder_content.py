@@ -50,7 +50,7 @@ def images_in(folder: Path) -> list[Path]:
     raise UserError(f"{folder}: holds no images ({', '.join(SUFFIXES)}); give the folder that does, or a video")
 
 
-def left_out(folder: Path) -> list[str]:
+def photographs_left_out(folder: Path) -> list[str]:
     """Name the photographs of a folder that are left out, because their formats are not read; those of which there is
     an image as well do not count."""
     images = {file.stem for file in files_in(folder, SUFFIXES)}

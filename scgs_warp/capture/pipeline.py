@@ -22,6 +22,7 @@ from .colmap import remove_database
 from .completeness import Incomplete
 from .diagnosis import Outcome, notes, too_few
 from .features import CameraModel, FrameFiles, Matching
+from .folder_content import photographs_left_out
 from .given_masks import read_masks
 from .journal import Journal, disk_errors
 from .limits import check_limits
@@ -351,7 +352,7 @@ def _share(journal: Journal) -> float:
 def _lines(request: CaptureRequest, frames: PickedFrames, outcome: Outcome) -> list[str]:
     left_out = f" ({frames.blurred} blurred, {frames.alike} alike)" if frames.blurred or frames.alike else ""
     missing = [] if frames.incomplete is None else [f"note: {request.source}: {frames.incomplete.describe()}"]
-    missing += left_out(request.source) if request.source.is_dir() else []
+    missing += photographs_left_out(request.source) if request.source.is_dir() else []
     return [
         f"{outcome.picked} of {frames.seen} frames picked{left_out}, {frames.size[0]} x {frames.size[1]}; "
         f"{100 * outcome.masked:.0f} % of their pixels move; {outcome.links.features} features a frame",

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from helpers.films import encoded, mask_images, pan, stream
-from scgs_warp.capture.folder_content import left_out
+from scgs_warp.capture.folder_content import photographs_left_out
 from scgs_warp.capture.rig.instants import frame_seconds
 from scgs_warp.capture.source import DIGEST_BYTES, Folder, Video, open_source, rotate_image
 from scgs_warp.errors import UserError
@@ -137,11 +137,11 @@ def test_folders_without_images_say_what_they_hold(tmp_path):
 def test_photographs_in_other_formats_are_counted(tmp_path):
     for name in ("1.jpg", "1.dng", "2.HEIC", "3.heic"):
         (tmp_path / name).write_bytes(b"x")
-    (note,) = left_out(tmp_path)
+    (note,) = photographs_left_out(tmp_path)
     assert "2 photographs in other formats (.heic) are left out" in note
     (tmp_path / "2.HEIC").unlink()
     (tmp_path / "3.heic").unlink()
-    assert left_out(tmp_path) == []
+    assert photographs_left_out(tmp_path) == []
 
 
 def test_what_identifies_a_source_covers_whole_files(tmp_path):
