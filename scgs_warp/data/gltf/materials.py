@@ -83,7 +83,7 @@ def read_materials(file: GltfFile) -> tuple[list[Material], list[Texture]]:
         if isinstance(glossy, dict):
             factor, info = glossy.get("diffuseFactor"), glossy.get("diffuseTexture")
         shines = _shines_only(factor, material)
-        if shines:  # as programs export what shall look the same in any light
+        if factor and shines:  # as programs export what shall look the same in any light
             factor, info = [*material.emissiveFactor, factor[3]], material.emissiveTexture
         coordinates, transform = _placing(info)
         materials.append(
