@@ -79,7 +79,7 @@ def assemble(
     is cut out (:func:`is_transparent`); otherwise it is dropped, and the frames get border masks and background points.
 
     Args:
-        one_size: whether to refuse files of different sizes.
+        one_size: whether to refuse files of different sizes, unless their cameras state them.
         border: [H, W] bool, False on the border of the video; applied to images without alpha.
         notes: lines for the user, kept with the data set.
 
@@ -106,10 +106,10 @@ def assemble(
     borders: dict[tuple[int, int], Tensor | None] = {}
     views = []
     for record, fact, key in zip(records, facts, keys):
-        if one_size and fact.source != facts[0].source:
+        if one_size and fact.source != facts[0].source and not (record.states_size and records[0].states_size):
             raise UserError(
                 f"{record.file}: is {size_text(fact.source)}, but {records[0].file.name} is "
-                f"{size_text(facts[0].source)}; give all images of a split one size"
+                f"{size_text(facts[0].source)}; give all images of a split one size, or each frame its w and h"
             )
         has_alpha = fact.has_alpha and cut_out
         if fact.has_alpha and not has_alpha:

@@ -118,7 +118,26 @@ def choose(
         if not indices:
             raise UserError(f"{where}: no frame is of the cameras and instants that --only-cameras and --frames choose")
     kept, notes = present(where, files, indices, options, remedy)
-    return Choice(kept, list(times) if instants is None else instants.scaled(times), notes)
+    kept, repeated = _once(where, files, times, kept)
+    return Choice(kept, list(times) if instants is None else instants.scaled(times), (*notes, *repeated))
+
+
+def _once(
+    where: Path, files: Sequence[Path], times: Sequence[float], indices: Sequence[int]
+) -> tuple[list[int], tuple[str, ...]]:
+    """Return the ``indices`` without frames that repeat the image and time of an earlier one, and a note on these. A
+    repeated frame could be held out and trained on at the same time."""
+    first: dict[tuple[Path, float], int] = {}
+    for index in indices:
+        first.setdefault((files[index], times[index]), index)
+    kept = list(first.values())
+    repeated = sorted(set(indices) - set(kept))
+    if not repeated:
+        return kept, ()
+    names = _listed([files[index].name for index in repeated], NAMED)
+    return kept, (
+        f"{where}: {len(repeated)} of {len(indices)} frames are left out, because they repeat others ({names})",
+    )
 
 
 def present(

@@ -45,6 +45,9 @@ OPAQUE, CUT_OUT = 0.98, 1e-3
 """Alpha from which a pixel is opaque, and the share of other pixels above which a file is cut out. Programs that resize
 images leave single pixels of alpha 254."""
 
+LEAST_REDUCTION, MAX_ASPECT_ERROR = 1.5, 0.01
+"""How many times smaller reduced images are at least, and the largest relative error of their proportions."""
+
 INSPECTED = 1024
 """Number of bytes by which a file that is no image is recognised."""
 
@@ -58,6 +61,13 @@ R = TypeVar("R")
 def size_text(size: Sequence[float]) -> str:
     """Format (width, height) as ``800 x 600 pixels``."""
     return f"{size[0]} x {size[1]} pixels"
+
+
+def is_reduced(size: tuple[int, int], full: tuple[int, int]) -> bool:
+    """Return whether an image of this size is a reduced one of the full size: the proportions are kept up to the
+    rounding to whole pixels."""
+    difference = abs(size[1] - size[0] * full[1] / full[0])
+    return size[0] * LEAST_REDUCTION <= full[0] and difference <= max(1.0, MAX_ASPECT_ERROR * size[1])
 
 
 class Decoded(NamedTuple):

@@ -16,7 +16,7 @@ from ..choice import choose
 from ..dataset import Dataset
 from ..far_origin import moved, note, offset_of
 from ..held_out import held_out
-from ..images import ReadOptions, header_sizes, size_text
+from ..images import ReadOptions, header_sizes, is_reduced, size_text
 from ..lens import Lens, make_lens, rescaled
 from ..name_times import times_from_names
 from ..natural_order import natural
@@ -25,8 +25,6 @@ from .colmap_model import ModelCamera, ModelImage, find_model, read_model
 
 MADE_FROM = "give the images that the model was made from, with their names"
 """What to do about missing images."""
-LEAST_REDUCTION, MAX_ASPECT_ERROR = 1.5, 0.01
-"""How many times smaller reduced images are at least, and the largest relative error of their proportions."""
 
 
 def recognises(folder: Path) -> bool:
@@ -124,7 +122,7 @@ def _lens(model_folder: Path, image: ModelImage, camera: ModelCamera, source: tu
     Images that are only a little smaller are others, undistorted or cropped, even in the same proportions.
     """
     full = camera.width, camera.height
-    if full != source and not _is_reduced(source, full):
+    if full != source and not is_reduced(source, full):
         raise UserError(
             f"{model_folder}: camera {image.camera}, of {image.name}, is of {camera.width} x {camera.height} pixels, "
             f"but the image is {size_text(source)}; give the images that the model was made from, or a model of these "
@@ -137,10 +135,3 @@ def _lens(model_folder: Path, image: ModelImage, camera: ModelCamera, source: tu
         raise UserError(
             f"{model_folder}: camera {image.camera}, of {image.name}: {error}; undistort the images"
         ) from None
-
-
-def _is_reduced(size: tuple[int, int], full: tuple[int, int]) -> bool:
-    """Return whether an image of this size is a reduced one of the full size: the proportions are kept up to the
-    rounding to whole pixels."""
-    difference = abs(size[1] - size[0] * full[1] / full[0])
-    return size[0] * LEAST_REDUCTION <= full[0] and difference <= max(1.0, MAX_ASPECT_ERROR * size[1])

@@ -18,7 +18,17 @@ from ..choice import Choice, choose, choose_instants, of_cameras, present
 from ..dataset import Dataset
 from ..held_out import held_out
 from ..images import ReadOptions
-from .transforms import find_mask, read_distortion, read_lens, read_pose, read_times, read_transforms
+from ..moved_images import parts_of
+from .transforms import (
+    Times,
+    find_mask,
+    note_reduced,
+    read_distortion,
+    read_lens,
+    read_pose,
+    read_times,
+    read_transforms,
+)
 from .transforms_images import find_images
 
 
@@ -44,7 +54,7 @@ def read(folder: Path, split: str, options: ReadOptions) -> Dataset:
     content = read_transforms(path)
     entries = content["frames"]
     poses = [read_pose(path, index, entry) for index, entry in enumerate(entries)]
-    times = read_times(path, entries)
+    times, scaled = _times(folder, path, entries)
     if not shared and split != "train":
         _check_times(folder, path, entries)
     located = find_images(path, folder, entries)
@@ -56,6 +66,10 @@ def read(folder: Path, split: str, options: ReadOptions) -> Dataset:
     else:
         choice = _within_training(folder, path, files, times, options)
     chosen = held_out(path, choice.indices, split) if shared else choice.indices
+    smaller = note_reduced(path, {**content, **entries[chosen[0]]}, files[chosen[0]])
+    notes = [*located.notes, *scaled, *choice.notes, *smaller]
+    if not shared and split != "train":
+        notes += _of_trained(folder, path, [entries[index] for index in chosen])
     records = []
     for index in chosen:
         fields = {**content, **entries[index]}
@@ -65,7 +79,7 @@ def read(folder: Path, split: str, options: ReadOptions) -> Dataset:
         mask = find_mask(path, folder, index, entries[index])
         frame = (files[index], poses[index], choice.times[index], lens, files[index].stem, mask)
         records.append(FrameRecord(*frame, states_size=states_size))
-    return assemble(records, options, folder=folder, split=split, one_size=True, notes=[*located.notes, *choice.notes])
+    return assemble(records, options, folder=folder, split=split, one_size=True, notes=notes)
 
 
 def _path(folder: Path, split: str) -> tuple[Path, bool]:
@@ -75,6 +89,33 @@ def _path(folder: Path, split: str) -> tuple[Path, bool]:
     if not there and transforms_path(folder, "train").is_file():
         return transforms_path(folder, "train"), True
     return transforms_path(folder, split if split in ("train", *there) else (there or [split])[0]), False
+
+
+def _times(folder: Path, path: Path, entries: list[dict[str, Any]]) -> Times:
+    """Return the times of a file's frames, on the scale of those of all splits."""
+    paths = [transforms_path(folder, split) for split in ("train", "test", "val")]
+    others = [read_transforms(other)["frames"] for other in paths if other != path and other.is_file()]
+    return read_times(path, entries, [entry for frames in others for entry in frames])
+
+
+def _of_trained(folder: Path, path: Path, held: list[dict[str, Any]]) -> list[str]:
+    """Return a note if held-out frames are among those that are trained on."""
+    training = transforms_path(folder, "train")
+    if not training.is_file():
+        return []
+    trained = {_identity(entry) for entry in read_transforms(training)["frames"]}
+    count = sum(_identity(entry) in trained for entry in held)
+    if count == 0:
+        return []
+    return [
+        f"{path}: {count} of {len(held)} frames are trained on as well, so that their scores are not of held-out "
+        f"views; remove {path.name} to hold out every eighth training frame"
+    ]
+
+
+def _identity(entry: dict[str, Any]) -> tuple[str, str]:
+    """Return what two entries of one image have in common."""
+    return "/".join(parts_of(str(entry.get("file_path")))), str(entry.get("time"))
 
 
 def _check_times(folder: Path, path: Path, entries: list[dict[str, Any]]) -> None:
@@ -99,7 +140,7 @@ def _within_training(folder: Path, path: Path, files: list[Path], times: list[fl
     indices, scaled = list(range(len(files))), times
     if options.frames:
         training = transforms_path(folder, "train")
-        instants = choose_instants(read_times(training, read_transforms(training)["frames"]), options)
+        instants = choose_instants(_times(folder, training, read_transforms(training)["frames"]).times, options)
         assert instants is not None
         indices = [index for index in indices if instants.first <= times[index] <= instants.last]
         scaled = instants.scaled(times)

@@ -28,7 +28,16 @@ from ..held_out import held_out
 from ..images import ReadOptions
 from ..natural_order import by_name
 from ..points import read_points
-from .transforms import find_mask, read_distortion, read_lens, read_pose, read_times, read_transforms
+from .transforms import (
+    Times,
+    find_mask,
+    note_reduced,
+    read_distortion,
+    read_lens,
+    read_pose,
+    read_times,
+    read_transforms,
+)
 from .transforms_images import find_images
 
 FILE = "transforms.json"
@@ -54,7 +63,7 @@ def read(folder: Path, split: str, options: ReadOptions) -> Dataset:
     content = read_transforms(path)
     located = find_images(path, folder, content["frames"])
     entries, files = located.entries, located.files
-    times = _times(path, entries, files)
+    times, scaled = _times(path, entries, files)
     for entry in entries:
         read_distortion(path, {**content, **entry})
     choice = choose(path, files, times, options, [file.relative_to(folder).parent.as_posix() for file in files])
@@ -68,7 +77,10 @@ def read(folder: Path, split: str, options: ReadOptions) -> Dataset:
         for index in chosen
     ]
     border = video_border([files[index] for index in choice.indices], [times[index] for index in choice.indices])
-    notes = [*located.notes, *choice.notes, *([] if offset is None else [note(offset)]), *_of_depth(path, content)]
+    first = choice.indices[0]
+    smaller = note_reduced(path, {**content, **entries[first]}, files[first])
+    notes = [*located.notes, *scaled, *choice.notes, *smaller, *([] if offset is None else [note(offset)])]
+    notes += _of_depth(path, content)
     data = assemble(records, options, folder=folder, split=split, one_size=True, border=border, notes=notes)
     return with_points(data, *_points(path, folder, content, data.cameras, np.zeros(3) if offset is None else offset))
 
@@ -112,12 +124,12 @@ def _of_depth(path: Path, content: dict[str, Any]) -> list[str]:
     return [f"{path} has no depth_unit_scale_factor: depth maps are read as millimetres; give 1 if they are in metres"]
 
 
-def _times(path: Path, entries: list[dict[str, Any]], files: list[Path]) -> list[float]:
+def _times(path: Path, entries: list[dict[str, Any]], files: list[Path]) -> Times:
     if any(entry.get("time") is not None for entry in entries):
         return read_times(path, entries)
     moments = _moments(files)
     last = max(len(set(moments)) - 1, 1)
-    return [moment / last for moment in moments]
+    return Times([moment / last for moment in moments], ())
 
 
 def _moments(files: list[Path]) -> list[int]:
@@ -178,7 +190,8 @@ class _Names:
         self._numbers: dict[str, int] = {}
         short: dict[str, list[int]] = {}
         for index, name in enumerate(names):
-            self._numbers[name] = self._numbers[_plain(name)] = index
+            self._numbers.setdefault(name, index)
+            self._numbers.setdefault(_plain(name), index)
             short.setdefault(_plain(name).rsplit("/", 1)[-1], []).append(index)
         for name, indices in short.items():
             if len(indices) == 1:

@@ -7,16 +7,16 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from ...errors import UserError
-from ...geometry.rotation import is_rotation
+from ...geometry.rotation import RIGID_TOLERANCE, is_rotation
 from ...storage.json_files import as_number, numbers, read_json
 from ...storage.safe_paths import inside
-from ..images import size_text
-from ..lens import Lens, make_lens
+from ..images import header_sizes, is_reduced, size_text
+from ..lens import Lens, make_lens, rescaled
 
 OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 SUFFIXES = (".png", ".jpg", ".jpeg", ".webp")
@@ -28,6 +28,8 @@ PERSPECTIVES = ("PERSPECTIVE", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RA
 and tangential; for FULL_OPENCV the radial part is a quotient of polynomials."""
 FISHEYES = ("OPENCV_FISHEYE", "FISHEYE", "SIMPLE_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
 """Camera models in which the distance from the centre is a polynomial of the angle to the optical axis."""
+MOST_SCALE = 1e6
+"""Largest scale of a camera that is left out, and the inverse of the smallest one."""
 CORNER = 0.95
 """Shares of width and height beyond which a principal point is that of larger images."""
 
@@ -45,7 +47,8 @@ def read_transforms(path: Path) -> dict[str, Any]:
 
 
 def read_pose(path: Path, index: int, entry: dict[str, Any]) -> np.ndarray:
-    """Return world-to-camera [4, 4] float64, OpenCV."""
+    """Return world-to-camera [4, 4] float64, OpenCV. The scale of a camera, which Blender exports, is left out: it
+    changes nothing of what the camera sees."""
     where = f"{path}: frames[{index}].transform_matrix"
     if "transform_matrix" not in entry:
         raise UserError(f"{where} is missing; give the 4 x 4 camera-to-world matrix")
@@ -58,20 +61,44 @@ def read_pose(path: Path, index: int, entry: dict[str, Any]) -> np.ndarray:
         raise UserError(f"{where} has shape {list(matrix.shape)}; give 4 rows of 4 numbers")
     if not np.isfinite(matrix).all():
         raise UserError(f"{where} holds NaN or infinity; correct the pose or drop the frame")
+    matrix[:3, :3] = _unscaled(matrix[:3, :3])
     if not is_rotation(matrix[:3, :3]) or np.abs(matrix[3] - [0, 0, 0, 1]).max() > 1e-6:
         raise UserError(
-            f"{where} is not rigid (scaled, sheared, mirrored, or last row not 0 0 0 1); "
+            f"{where} is not rigid (sheared, mirrored, scaled unevenly, or last row not 0 0 0 1); "
             "give a rotation and a translation, or drop the frame"
         )
     return np.linalg.inv(matrix @ OPENGL_TO_OPENCV)
 
 
-def read_times(path: Path, entries: list[dict[str, Any]]) -> list[float]:
-    """Return every frame's time in [0, 1]; if no frame has a time, times are evenly spaced in the order of the file."""
+def _unscaled(matrix: np.ndarray) -> np.ndarray:
+    """Divide a matrix [3, 3] by its scale, if that is the same along all axes."""
+    if np.abs(matrix).max() > MOST_SCALE:
+        return matrix
+    lengths = np.linalg.norm(matrix, axis=0)
+    scale = float(lengths.mean())
+    even = scale > 1.0 / MOST_SCALE and np.abs(lengths / scale - 1.0).max() <= RIGID_TOLERANCE
+    return matrix / scale if even and abs(scale - 1.0) > RIGID_TOLERANCE else matrix
+
+
+class Times(NamedTuple):
+    times: list[float]
+    """Times in [0, 1]."""
+    notes: tuple[str, ...]
+    """Lines that the user should read."""
+
+
+def read_times(path: Path, entries: list[dict[str, Any]], others: list[dict[str, Any]] | None = None) -> Times:
+    """Return every frame's time; if no frame has a time, times are evenly spaced in the order of the file.
+
+    Times beyond [0, 1], such as seconds or numbers of frames, are scaled to go from 0 to 1.
+
+    Args:
+        others: frames of other files, on the same scale of time; None without others.
+    """
     given = [entry.get("time") is not None for entry in entries]
     if not any(given):
         last = max(len(entries) - 1, 1)
-        return [index / last for index in range(len(entries))]
+        return Times([index / last for index in range(len(entries))], ())
     times = []
     for index, entry in enumerate(entries):
         where = f"{path}: frames[{index}].time"
@@ -80,11 +107,17 @@ def read_times(path: Path, entries: list[dict[str, Any]]) -> list[float]:
         time = as_number(entry["time"])
         if time is None:
             raise UserError(f"{where} is {str(entry['time'])[:40]!r}, not a number; give a number from 0 to 1")
-        if not 0.0 <= time <= 1.0:
-            remedy = "subtract the first time from all, and divide by the last one"
-            raise UserError(f"{where} is {time:g}, outside [0, 1]; {remedy}")
         times.append(time)
-    return times
+    elsewhere = [as_number(entry.get("time")) for entry in others or []]
+    known = [*times, *(time for time in elsewhere if time is not None)]
+    first, last = min(known), max(known)
+    if 0.0 <= first and last <= 1.0:
+        return Times(times, ())
+    length = last - first
+    if not length < math.inf:
+        raise UserError(f"{path}: the times of frames go from {first:g} to {last:g}; give numbers from 0 to 1")
+    scaled = [(time - first) / length if length > 0.0 else 0.0 for time in times]
+    return Times(scaled, (f"{path}: times from {first:.10g} to {last:.10g} are scaled to go from 0 to 1",))
 
 
 def find_mask(path: Path, folder: Path, index: int, entry: dict[str, Any]) -> Path | None:
@@ -150,8 +183,30 @@ def _parameter(path: Path, key: str, value: Any) -> float:
     return number
 
 
+def reduced_from(fields: dict[str, Any], source: tuple[int, int]) -> tuple[int, int] | None:
+    """Return the size that a frame states, if images of the size ``source`` are reduced ones of it; else None."""
+    width, height = as_number(fields.get("w")), as_number(fields.get("h"))
+    if width is None or height is None or not 1.0 <= min(width, height) <= max(width, height) < MOST_SCALE:
+        return None
+    full = (round(width), round(height))
+    return full if full == (width, height) and is_reduced(source, full) else None
+
+
+def note_reduced(path: Path, fields: dict[str, Any], file: Path) -> list[str]:
+    """Return a note if the image of a frame is smaller than the frame states."""
+    for source in header_sizes(file):
+        full = reduced_from(fields, source)
+        if full is not None:
+            return [
+                f"{path}: images are {size_text(source)}, the cameras {size_text(full)}; the cameras are scaled to "
+                "the images"
+            ]
+    return []
+
+
 def read_lens(path: Path, fields: dict[str, Any], index: int, source: tuple[int, int]) -> Lens:
-    """Return the lens at the size of the file, ``source`` (width, height).
+    """Return the lens at the size of the file, ``source`` (width, height). It may be a reduced one of the size that is
+    stated.
 
     Args:
         fields: the fields of the file, overridden by those of a frame.
@@ -159,12 +214,15 @@ def read_lens(path: Path, fields: dict[str, Any], index: int, source: tuple[int,
     Raises:
         UserError: intrinsics are missing or invalid, or belong to images of a size other than ``source``.
     """
-    fx, fy, cx, cy = read_intrinsics(path, fields, index, source)
+    full = reduced_from(fields, source) or source
+    fx, fy, cx, cy = read_intrinsics(path, fields, index, full)
     model, further = read_distortion(path, fields)
     if model == "PINHOLE":
-        return Lens(fx, fy, cx, cy)
+        sx, sy = source[0] / full[0], source[1] / full[1]
+        return Lens(fx * sx, fy * sy, cx * sx, cy * sy)
     try:
-        return make_lens(model, (fx, fy, cx, cy, *further))
+        lens = make_lens(model, (fx, fy, cx, cy, *further))
+        return lens if full == source else rescaled(lens, full, source)
     except ValueError as error:
         raise UserError(f"{path}: frames[{index}]: {error}; correct the lens, or undistort the images") from None
 

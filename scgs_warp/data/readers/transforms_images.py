@@ -29,10 +29,12 @@ def find_images(path: Path, folder: Path, entries: list[dict[str, Any]]) -> Fram
     Raises:
         UserError: a name is no text, or leads out of the folder.
     """
-    names = [entry.get("file_path") for entry in entries]
-    for index, name in enumerate(names):
+    names: list[str] = []
+    for index, entry in enumerate(entries):
+        name = entry.get("file_path")
         if not isinstance(name, str) or not name:
             raise UserError(f"{path}: frames[{index}].file_path is missing or not text; name the image file")
+        names.append(name)
     if not any(_existing(folder, name) for name in names):
         moved = _moved(path, folder, entries)
         if moved is not None:

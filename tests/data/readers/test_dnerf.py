@@ -84,6 +84,52 @@ def test_either_all_files_have_times_or_none(tmp_path):
         load(scene, "test")
 
 
+@pytest.mark.parametrize("unit", [30.0, 1.5, -1.0])
+def test_times_in_other_units_are_scaled_alike_in_all_files(tmp_path, unit):
+    """Seconds, or numbers of frames; the held-out frame is of the middle of the film."""
+    scene, test = tmp_path / "s", tmp_path / "s/transforms_test.json"
+    write_scene(scene)
+    edit(scene, lambda content: [frame.update(time=7 + unit * frame["time"]) for frame in content["frames"]])
+    content = json.loads(test.read_text())
+    content["frames"][0]["time"] = 7 + unit / 2
+    test.write_text(json.dumps(content))
+    train, held = load(scene), load(scene, "test")
+    assert train.times.tolist() == ([0.0, 0.5, 1.0] if unit > 0 else [1.0, 0.5, 0.0]) and held.times.tolist() == [0.5]
+    assert any("are scaled to go from 0 to 1" in note for note in train.notes)
+    edit(scene, lambda content: [frame.update(time=2.0) for frame in content["frames"]])
+    test.unlink()
+    assert load(scene).times.tolist() == [0.0, 0.0]  # one of three is held out
+
+
+def test_held_out_frames_that_are_trained_on_are_noted(tmp_path):
+    write_scene(tmp_path / "s")
+    test = tmp_path / "s/transforms_test.json"
+    content = json.loads(test.read_text())
+    (tmp_path / "s/other.png").write_bytes((tmp_path / "s/train/r_000.png").read_bytes())
+    content["frames"][0]["file_path"] = "./other"
+    test.write_text(json.dumps(content))
+    assert not load(tmp_path / "s", "test").notes
+    (tmp_path / "s/transforms_test.json").write_text((tmp_path / "s/transforms_train.json").read_text())
+    assert any("3 of 3 frames are trained on as well" in note for note in load(tmp_path / "s", "test").notes)
+    assert not load(tmp_path / "s").notes
+
+
+@pytest.mark.parametrize("scale", [0.01, 0.35, 40.0])
+def test_the_scale_of_a_camera_does_not_count(tmp_path, scale):
+    """Blender exports the scale of a camera's object, which changes nothing of its view."""
+    write_scene(tmp_path / "s")
+    expected = [camera.viewmat for camera in load(tmp_path / "s").cameras]
+
+    def change(content):
+        for frame in content["frames"]:
+            matrix = np.array(frame["transform_matrix"])
+            matrix[:3, :3] *= scale
+            frame["transform_matrix"] = matrix.tolist()
+
+    edit(tmp_path / "s", change)
+    assert all(torch.allclose(camera.viewmat, view) for camera, view in zip(load(tmp_path / "s").cameras, expected))
+
+
 @pytest.mark.parametrize("split", ["test", "val"])
 def test_held_out_frames_alone_hide_no_other_layout(split, tmp_path):
     write_scene(tmp_path / "s")
@@ -116,8 +162,10 @@ BAD_CONTENT = {
     "time text": (frame_field("time", "noon"), "frames[1].time"),
     "time null": (frame_field("time", None), "frames[1].time"),
     "time nan": (frame_field("time", float("nan")), "frames[1].time"),
-    "time beyond": (frame_field("time", 1.5), "frames[1].time is 1.5"),
-    "time before": (frame_field("time", -0.1), "frames[1].time is -0.1"),
+    "times apart": (
+        lambda content: [content["frames"][1].update(time=1.5e308), content["frames"][2].update(time=-1.5e308)],
+        "the times of frames go from -1.5e+308 to 1.5e+308",
+    ),
     "time absent": (lambda content: content["frames"][1].pop("time"), "frames[1].time"),
     "images missing": (
         lambda content: [entry.update(file_path="./train/nowhere") for entry in content["frames"][1:]],

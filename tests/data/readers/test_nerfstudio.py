@@ -190,6 +190,67 @@ def test_fields_that_programs_leave_empty(tmp_path):
     assert "frames[0].time is missing" in message(tmp_path)
 
 
+def test_times_in_seconds(tmp_path):
+    content = write(tmp_path)
+    expected = load(tmp_path).times
+    for frame in content["frames"]:
+        frame["time"] = 1700000000.0 + 12.5 * frame["time"]
+    save(tmp_path, content)
+    data = load(tmp_path)
+    assert torch.allclose(data.times, expected) and "are scaled to go from 0 to 1" in data.notes[0]
+
+
+def test_frames_that_repeat_others_are_left_out(tmp_path):
+    """Else the copy of a held-out frame would be trained on."""
+    content = write(tmp_path, 10)
+    frames = content["frames"]
+    again = {**frames[2], "time": 0.9}
+    save(tmp_path, {**content, "frames": [*frames, *frames, again]})
+    train, test = load(tmp_path), load(tmp_path, "test")
+    assert len(train) + len(test) == 11 and not {frame.name for frame in train} & {frame.name for frame in test}
+    assert "10 of 21 frames are left out, because they repeat others (f_0.png" in train.notes[0]
+    lists = {"train_filenames": ["f_1.png", "f_2.png"], "test_filenames": ["f_3.png"]}
+    save(tmp_path, {**content, **lists, "frames": [*frames, *frames]})
+    assert [frame.name for frame in load(tmp_path)] == ["f_1", "f_2"]
+
+
+def test_images_of_several_sizes(tmp_path):
+    """As of a phone that is turned while it films; each frame states its size."""
+    content = write(tmp_path)
+    for key in ("w", "h", "cx", "cy"):
+        content.pop(key)
+    for frame in content["frames"][::2]:
+        file = str(tmp_path / frame["file_path"])
+        image = cv2.imread(file)
+        assert image is not None
+        cv2.imwrite(file, image[:, :24])
+    save(tmp_path, content)
+    assert "give all images of a split one size, or each frame its w and h" in message(tmp_path)
+    for index, frame in enumerate(content["frames"]):
+        frame.update(w=WIDTH if index % 2 else 24, h=HEIGHT, cx=WIDTH / 2, cy=HEIGHT / 2)
+    save(tmp_path, content)
+    data = load(tmp_path)
+    assert {camera.width for camera in data.cameras} == {24, WIDTH} and share_of_colors_found(data) > 0.8
+
+
+@pytest.mark.parametrize("lens", [{}, {"camera_model": "OPENCV", "k1": 0.01}])
+def test_images_smaller_than_stated(tmp_path, lens):
+    content = write(tmp_path, **lens)
+    full = load(tmp_path, downscale=2)
+    for frame in content["frames"]:
+        image = cv2.imread(str(tmp_path / frame["file_path"]))
+        assert image is not None
+        (tmp_path / "images_2").mkdir(exist_ok=True)
+        small = cv2.resize(image, (WIDTH // 2, HEIGHT // 2), interpolation=cv2.INTER_AREA)
+        cv2.imwrite(str(tmp_path / "images_2" / frame["file_path"]), small)
+        (tmp_path / frame["file_path"]).unlink()
+    data = load(tmp_path)
+    assert torch.equal(data[1].camera.K, full[1].camera.K) and data[1].image.shape == full[1].image.shape
+    assert any("images are 20 x 15 pixels, the cameras 40 x 30 pixels" in note for note in data.notes)
+    save(tmp_path, {**content, "h": HEIGHT + 10})
+    assert "h is 40, but the images are 20 x 15 pixels" in message(tmp_path) or "w is 40" in message(tmp_path)
+
+
 def test_masks_of_frames(tmp_path):
     content = write(tmp_path)
     mask = np.full((HEIGHT, WIDTH), 255, np.uint8)
@@ -239,7 +300,7 @@ FAULTS = {
         lambda content: [content.update(fl_x=100.0, cx=40.0, cy=30.0), content.pop("w"), content.pop("h")],
         "has cx 40 and cy 30, the lower right corner of images of 40 x 30 pixels; give the intrinsics of",
     ),
-    "time": (lambda content: content["frames"][0].__setitem__("time", 3), "frames[0].time is 3, outside"),
+    "time": (lambda content: content["frames"][0].__setitem__("time", "3"), "frames[0].time is '3', not a number"),
     "split": (lambda content: content.__setitem__("train_filenames", []), "train_filenames is empty"),
     "pose": (lambda content: content["frames"][0].__setitem__("transform_matrix", [[1]]), "frames[0].transform_matrix"),
 }
