@@ -11,11 +11,13 @@ from ..errors import UserError, shell_words
 from .readers.transforms import SUFFIXES as IMAGES
 
 VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".gif")
-ARCHIVES = (".zip", ".tar", ".gz", ".tgz", ".bz2", ".xz", ".7z", ".rar", ".zst")
+ARCHIVES = (".zip", ".r3d", ".tar", ".gz", ".tgz", ".bz2", ".xz", ".7z", ".rar", ".zst")
 SPLATS = (".ply", ".splat", ".spz", ".sog", ".ksplat")
 DEEPEST, MOST_FOLDERS = 3, 200
 """Depth to which, and number of folders in which, a data set is looked for."""
 FEWEST_PHOTOS = 3
+RECORD3D = (("metadata.json", "rgb"), ("metadata", "rgbd"))
+"""Files and folders by which an export of Record3D is recognised."""
 
 
 def not_a_folder(path: Path) -> UserError:
@@ -41,6 +43,11 @@ def not_a_folder(path: Path) -> UserError:
             f"{path}: holds Gaussians or points, not images; to see a file of Gaussians: scgs-warp view --ply "
             f"{shell_words(path)} "
             "--output film.mp4"
+        )
+    if suffix == ".npz":
+        return UserError(
+            f"{path}: is no folder; if it holds the cameras of MegaSaM, VGGT or Depth Anything 3: scgs-warp capture "
+            f"--poses {shell_words(path)} --output {shell_words(f'data/{path.stem}')}"
         )
     if suffix == ".json" or path.name == "poses_bounds.npy":
         return UserError(f"{path}: is a file of a data set; give its folder: --data {shell_words(path.parent)}")
@@ -69,6 +76,12 @@ def no_layout(folder: Path, recognised: Callable[[Path], bool]) -> UserError:
     above = next((outer for outer in list(folder.parents)[:2] if recognised(outer)), None)
     if above is not None:
         return UserError(f"{folder}: is a part of a data set; give its folder: --data {shell_words(above)}")
+    program = _exported_by(folder)
+    if program is not None:
+        return UserError(
+            f"{folder}: is an export of {program}; make a data set of it: scgs-warp capture --poses "
+            f"{shell_words(folder)} --output {shell_words(f'data/{folder.resolve().name}')}"
+        )
     if sum(entry.suffix.lower() in IMAGES for entry in entries) >= FEWEST_PHOTOS:
         return UserError(
             f"{folder}: holds images without cameras; find them with: scgs-warp capture {shell_words(folder)} --output "
@@ -82,6 +95,18 @@ def no_layout(folder: Path, recognised: Callable[[Path], bool]) -> UserError:
         "dataset.json (HyperNeRF, NeRF-DS), train_meta.json (Panoptic), poses_bounds.npy (Neural 3D Video) or sparse/0 "
         "(COLMAP); give the folder that holds one of these"
     )
+
+
+def _exported_by(folder: Path) -> str | None:
+    """Name the program whose export ``capture --poses`` reads; None for other folders."""
+    if (folder / "keyframes").is_dir():
+        return "Polycam"
+    for base in (folder, folder / "EXR_RGBD"):
+        if any((base / file).is_file() and (base / images).is_dir() for file, images in RECORD3D):
+            return "Record3D"
+    if any(folder.glob("frame_[0-9]*.json")):
+        return "3D Scanner App"
+    return "MonST3R" if (folder / "pred_traj.txt").is_file() else None
 
 
 def _below(folder: Path) -> Iterator[Path]:

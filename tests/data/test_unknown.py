@@ -29,6 +29,8 @@ def said(path: Path) -> str:
         ("transforms.json", "give its folder: --data {path.parent}"),
         ("one.jpg", "is one image"),
         ("notes", "is a file"),
+        ("scene.npz", "scgs-warp capture --poses {path} --output data/scene"),
+        ("take.r3d", "unpack it"),
     ],
 )
 def test_files(name, expected, tmp_path):
@@ -72,3 +74,21 @@ def test_a_folder_that_holds_a_film(tmp_path):
     (tmp_path / "take.mov").write_bytes(b"")
     with pytest.raises(UserError, match=r"take\.mov: a video has no cameras yet"):
         load(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("files", "program"),
+    [
+        (["keyframes/cameras/1.json", "keyframes/images/1.jpg", "mesh_info.json"], "Polycam"),
+        (["metadata.json", "rgb/0.jpg", "depth/0.exr"], "Record3D"),
+        (["EXR_RGBD/metadata", "EXR_RGBD/rgbd/0.jpg"], "Record3D"),
+        (["frame_00000.json", *(f"frame_0000{index}.jpg" for index in range(4))], "3D Scanner App"),
+        (["pred_traj.txt", *(f"frame_000{index}.png" for index in range(4))], "MonST3R"),
+    ],
+)
+def test_exports_that_capture_reads(tmp_path, files, program):
+    """Their images have cameras, so that they need not be found."""
+    for name in files:
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_bytes(b"")
+    assert f"is an export of {program}; make a data set of it: scgs-warp capture --poses {tmp_path}" in said(tmp_path)

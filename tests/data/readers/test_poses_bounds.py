@@ -120,3 +120,12 @@ def test_faults_are_named(tmp_path, fault):
     write_poses_bounds(tmp_path)
     edit(tmp_path)
     assert expected in message(tmp_path)
+
+
+def test_images_of_all_cameras_in_one_folder(tmp_path):
+    write_poses_bounds(tmp_path)
+    for camera in sorted(path for path in tmp_path.iterdir() if path.is_dir()):
+        for file in sorted(camera.rglob("*.png")):
+            (tmp_path / "images").mkdir(exist_ok=True)
+            file.rename(tmp_path / "images" / f"{camera.name}_{file.name}")
+    assert "holds 1 folders of images (images to images)" in message(tmp_path)
