@@ -160,6 +160,9 @@ def _unrecognised(token: str, words: Sequence[str], ask: str, *kinds: type) -> s
     before = words[at - 1] if at else ""
     if at > 1 and words[at - 2] == "--set" and not before.startswith("-"):
         return f"--set {before} {token}: write NAME=VALUE, for example --set {before}={token}"
+    joined = next((word.split("=")[0] for word in words if word.endswith(f"={token}")), before)
+    if joined in flags and _hint(joined, *kinds) == str(bool):
+        return f"{joined} {token}: takes no value; write {joined} alone, or leave it out"
     if before and not before.startswith("-"):
         return f"{token}: belongs to no option; quote a name that contains spaces ('{before} {token}')"
     likely = [flag for flag in (f"--{word}" for word in BARE_WORDS) if flag in flags]

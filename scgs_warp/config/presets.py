@@ -173,6 +173,10 @@ def from_dict(values: dict[str, Any], source: str = "config", base: Any = None, 
     return dataclasses.replace(base, **changes)
 
 
+WORDS = {int: "a whole number", float: "a number", bool: "true or false", str: "text"}
+"""What messages call the types of settings."""
+
+
 def _checked(value: Any, hint: Any, label: str) -> Any:
     if get_origin(hint) is Literal:
         if value not in get_args(hint):
@@ -183,10 +187,14 @@ def _checked(value: Any, hint: Any, label: str) -> Any:
             return float(value)
         except OverflowError:
             raise UserError(f"{label} is {str(value)[:20]}...; give a smaller number") from None
+    if hint is int and isinstance(value, float) and value.is_integer():
+        return int(value)
+    if hint is str and isinstance(value, int) and not isinstance(value, bool):
+        return str(value)  # a name that looks like a number
     if not isinstance(value, hint if not isinstance(hint, types.UnionType) else get_args(hint)) or (
         isinstance(value, bool) and hint is not bool
     ):
-        raise UserError(f"{label} is {value!r}; expected {getattr(hint, '__name__', hint)}")
+        raise UserError(f"{label} is {value!r}; give {WORDS.get(hint, 'another value')}")
     return value
 
 
@@ -217,7 +225,9 @@ def whole_number(value: Any, label: str) -> int:
 
 
 def parse_value(text: str) -> Any:
-    """Parse a JSON value; return any other text unchanged."""
+    """Parse a JSON value, or Python's True and False; return any other text unchanged."""
+    if text in ("True", "False"):
+        return text == "True"
     try:
         return parse_json(text)
     except ValueError:

@@ -42,7 +42,8 @@ def open_regular(path: Path | str) -> BinaryIO:
 
 
 def read_text(path: Path | str, most: int = MAX_TEXT, errors: str = "strict") -> str:
-    """Read a UTF-8 text of at most ``most`` bytes from a regular file; line ends become ``\\n``.
+    """Read a UTF-8 text of at most ``most`` bytes from a regular file; line ends become ``\\n``, and the mark that
+    editors of Windows put at the beginning is left out.
 
     Args:
         errors: treatment of bytes that are no UTF-8, as for ``bytes.decode``.
@@ -57,7 +58,7 @@ def read_text(path: Path | str, most: int = MAX_TEXT, errors: str = "strict") ->
             content += piece
             if len(content) > most:
                 raise OSError(errno.EFBIG, f"larger than {most >> 20} MiB", str(path))
-    return content.decode("utf-8", errors).replace("\r\n", "\n").replace("\r", "\n")
+    return content.decode("utf-8", errors).removeprefix("\ufeff").replace("\r\n", "\n").replace("\r", "\n")
 
 
 def read_bytes(path: Path, remedy: str) -> bytes:

@@ -35,7 +35,7 @@ def read_json(path: Path, needed: str = "restore it") -> dict[str, Any]:
         UserError: the file is missing, is not JSON, or holds something other than an object.
     """
     try:
-        text = read_text(path).removeprefix("\ufeff")  # editors of Windows put a mark there
+        text = read_text(path)
     except FileNotFoundError:
         raise UserError(f"{path}: no such file; {needed}") from None
     except OSError as error:

@@ -56,6 +56,30 @@ def test_mistakes_name_file_and_field(values, message):
     assert message in str(caught.value)
 
 
+def test_values_as_people_write_them():
+    config = C.preset("cpu")
+    for text, expected in (("True", True), ("False", False), ("true", True)):
+        assert (
+            C.with_field(config, "pretrain.progressive", C.parse_value(text), "--set").pretrain.progressive is expected
+        )
+    for text in ("300", "300.0", "3e2"):
+        assert C.with_field(config, "motion.nodes", C.parse_value(text), "--set").motion.nodes == 300
+    assert C.with_field(config, "data.only_cameras", C.parse_value("1"), "--set").data.only_cameras == "1"
+    for name, text, wanted in (
+        ("motion.nodes", "12.5", "a whole number"),
+        ("pretrain.progressive", "1", "true or false"),
+        ("optim.means", "fast", "a number"),
+        ("data.frames", "true", "text"),
+    ):
+        with pytest.raises(UserError, match=f"; give {wanted}$"):
+            C.with_field(config, name, C.parse_value(text), "--set")
+
+
+def test_a_file_that_begins_with_the_mark_of_windows(tmp_path):
+    (tmp_path / "config.json").write_text('\ufeff{"steps": 100}', encoding="utf-8")
+    assert C.read_config(tmp_path / "config.json") == {"steps": 100}
+
+
 def test_unreadable_files(tmp_path):
     with pytest.raises(UserError, match="cannot be read"):
         C.read_config(tmp_path / "none.json")
