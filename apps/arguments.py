@@ -8,6 +8,7 @@ import difflib
 import io
 import os
 import re
+import shutil
 import sys
 import typing
 from collections.abc import Iterator, Mapping, Sequence
@@ -24,6 +25,8 @@ BARE_WORDS = ("data", "run", "ply")
 SPLATS = (".ply", ".splat", ".spz", ".sog")
 WIDE = "4000"
 """Number of columns at which tyro breaks no line of an error."""
+NARROWEST = 40
+"""Smallest number of columns of ``--help``: tyro never ends in a few."""
 
 
 def program(name: str) -> str:
@@ -96,6 +99,8 @@ def one_line_errors(name: str, words: Sequence[str], *kinds: type) -> Iterator[N
     asks = any(word in ("-h", "--help") for word in words)
     if not asks:
         os.environ["COLUMNS"] = WIDE
+    elif shutil.get_terminal_size().columns < NARROWEST:
+        os.environ["COLUMNS"] = str(NARROWEST)
     try:
         with contextlib.redirect_stderr(said):
             yield
@@ -104,10 +109,9 @@ def one_line_errors(name: str, words: Sequence[str], *kinds: type) -> Iterator[N
             raise
         raise UserError(explain(said.getvalue(), name, words, *kinds)) from None
     finally:
-        if not asks:
-            os.environ.pop("COLUMNS")
-            if columns is not None:
-                os.environ["COLUMNS"] = columns
+        os.environ.pop("COLUMNS", None)
+        if columns is not None:
+            os.environ["COLUMNS"] = columns
 
 
 def _refuse_empty_paths(words: Sequence[str], *kinds: type) -> None:

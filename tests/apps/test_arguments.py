@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import os
 import shutil
 import subprocess
 import sys
@@ -139,3 +140,12 @@ def test_an_empty_name_is_not_the_current_folder(words, tmp_path, monkeypatch, c
     said = capsys.readouterr().err
     assert "an empty name" in said and said.count("\n") == 1
     assert not list(tmp_path.iterdir())
+
+
+def test_help_in_a_narrow_terminal():
+    """Tyro does not end where a few columns leave no room for a word."""
+    command = [sys.executable, "-m", "scgs_warp", "view", "--help"]
+    told = subprocess.run(
+        command, env={**os.environ, "COLUMNS": "1"}, capture_output=True, text=True, timeout=120, check=True
+    )
+    assert "--output" in told.stdout
