@@ -80,7 +80,7 @@ def read(folder: Path, split: str, options: ReadOptions) -> Dataset:
     first = choice.indices[0]
     smaller = note_reduced(path, {**content, **entries[first]}, files[first])
     notes = [*located.notes, *scaled, *choice.notes, *smaller, *([] if offset is None else [note(offset)])]
-    notes += _of_depth(path, content)
+    notes += _of_depth(path, content) + _without_depth(path, [entries[index] for index in chosen], records)
     data = assemble(records, options, folder=folder, split=split, one_size=True, border=border, notes=notes)
     return with_points(data, *_points(path, folder, content, data.cameras, np.zeros(3) if offset is None else offset))
 
@@ -103,7 +103,7 @@ def _record(
 
 
 def _depth(path: Path, folder: Path, content: dict[str, Any], index: int) -> DepthFile | None:
-    """Return the depth map that a frame names."""
+    """Return the depth map that a frame names; None without a name, or without such a file."""
     name = content["frames"][index].get("depth_file_path")
     if name is None or name == "":
         return None
@@ -112,7 +112,8 @@ def _depth(path: Path, folder: Path, content: dict[str, Any], index: int) -> Dep
     unit = as_number(content.get("depth_unit_scale_factor", MILLIMETRE))
     if unit is None or unit <= 0.0:
         raise UserError(f"{path}: depth_unit_scale_factor is no positive number; give the unit of the depth maps")
-    return DepthFile(inside(folder, name, f"{path}: frames[{index}].depth_file_path", "depth map"), unit)
+    file = inside(folder, name, f"{path}: frames[{index}].depth_file_path", "depth map")
+    return DepthFile(file, unit) if file.exists() else None
 
 
 def _of_depth(path: Path, content: dict[str, Any]) -> list[str]:
@@ -122,6 +123,19 @@ def _of_depth(path: Path, content: dict[str, Any]) -> list[str]:
     if not decimal or "depth_unit_scale_factor" in content:
         return []
     return [f"{path} has no depth_unit_scale_factor: depth maps are read as millimetres; give 1 if they are in metres"]
+
+
+def _without_depth(path: Path, chosen: list[dict[str, Any]], records: list[FrameRecord]) -> list[str]:
+    """Return a note if frames of a split name depth maps that are missing.
+
+    Args:
+        chosen: entries of the frames of ``records``.
+    """
+    named = [entry for entry in chosen if entry.get("depth_file_path")]
+    missing = len(named) - sum(record.depth is not None for record in records)
+    if missing == 0:
+        return []
+    return [f"{path}: {missing} of {len(named)} depth maps are missing; their frames count as frames without one"]
 
 
 def _times(path: Path, entries: list[dict[str, Any]], files: list[Path]) -> Times:

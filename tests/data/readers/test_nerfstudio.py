@@ -104,6 +104,19 @@ def test_depth_maps_of_decimals_without_a_unit_are_noted(tmp_path):
     assert not any("millimetres" in note for note in load(tmp_path).notes)
 
 
+def test_depth_maps_that_are_missing(tmp_path):
+    """Exports are often copied without them."""
+    content = write(tmp_path)
+    for index, entry in enumerate(content["frames"]):
+        entry["depth_file_path"] = f"depth_{index}.npy"
+    save(tmp_path, {**content, "depth_unit_scale_factor": 1.0})
+    data = load(tmp_path)
+    assert data.with_depth == [] and "18 of 18 depth maps are missing" in data.notes[-1]
+    np.save(tmp_path / "depth_0.npy", np.full((HEIGHT, WIDTH), 4.0, np.float32))
+    data = load(tmp_path)
+    assert data.with_depth == [0] and "17 of 18 depth maps are missing" in data.notes[-1]
+
+
 def test_intrinsics_of_a_frame_win(tmp_path):
     content = write(tmp_path)
     content["frames"][2] |= {"fl_x": 60.0, "fl_y": 70.0, "cx": 21.0}
