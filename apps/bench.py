@@ -9,6 +9,7 @@ from typing import Any, Literal
 
 from scgs_warp.apps.arguments import one_line_errors, program
 from scgs_warp.apps.cli import Device, prepare, run
+from scgs_warp.errors import UserError
 
 FIGURES = Path("docs/images")
 
@@ -102,7 +103,6 @@ def check(options: Common) -> None:
         UserError: names the option and the remedy.
     """
     from scgs_warp.config.presets import MotionConfig
-    from scgs_warp.errors import UserError
 
     run, against = getattr(options, "run", None), getattr(options, "against", None)
     for name in ("gaussians", "nodes", "motion", "table_s2"):
@@ -211,6 +211,8 @@ def main(args: list[str] | None) -> None:
     import tyro
 
     words = list(sys.argv[1:] if args is None else args)
+    if words and not words[0].startswith("-") and words[0] not in COMMANDS:
+        raise UserError(f"benchmark {words[0]}: choose one of {', '.join(COMMANDS)}")
     with one_line_errors("bench", words, *COMMANDS.values()):
         options: Common = tyro.extras.subcommand_cli_from_dict(
             COMMANDS, args=words, prog=program("bench"), description=__doc__
@@ -218,8 +220,6 @@ def main(args: list[str] | None) -> None:
     check(options)
     device = prepare(options.device, options.threads, options.memory_gib)
     if getattr(options, "playback", False) and device == "cuda":
-        from scgs_warp.errors import UserError
-
         raise UserError("--playback: on a GPU frames are recorded with the network; leave the option out")
 
     from scgs_warp.benchmark import plot, scaling

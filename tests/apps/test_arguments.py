@@ -19,6 +19,7 @@ CASES = {
     "train --stepz 5": "error: --stepz: no such option; did you mean --steps?; 'scgs-warp train --help' lists",
     "train --tensorboard=yes": "error: --tensorboard yes: takes no value; write --tensorboard alone, or leave it out",
     "train --progressive false": "error: --progressive false: takes no value; write --progressive alone",
+    "bench frames": "error: benchmark frames: choose one of frame, ",
     "train here": "error: here: belongs to no option; write --data here",
     "view cloud.ply": "error: cloud.ply: belongs to no option; write --ply cloud.ply",
     "train --data my film": "error: film: belongs to no option; quote a name that contains spaces ('my film')",

@@ -113,8 +113,8 @@ def read_rows(path: Path) -> np.ndarray:
 
 def _label(folder: Path, camera: Path) -> str:
     """Return the name of a camera's folder, or of its parent if the folder is called ``images``."""
-    parts = camera.relative_to(folder).parts
-    return parts[-2] if parts[-1] == "images" and len(parts) > 1 else parts[-1]
+    own = camera.parent if camera.name == "images" and camera.parent != folder else camera
+    return own.name
 
 
 def _cameras(folder: Path) -> list[Path]:
