@@ -17,6 +17,7 @@ from torch import Tensor
 from ..errors import UserError
 from ..formats.gaussian_ply import write_gaussian_ply
 from ..rendering.render import render
+from ..scene.arguments import given_camera, given_color
 from ..scene.scene import Scene
 from ..storage.files import write_atomically
 from ..types import Camera, Gaussians, Image
@@ -154,6 +155,7 @@ class EditSession(Posing):
 
     def pick(self, camera: Camera, x: float, y: float, time: float, at: float | None = None) -> np.ndarray | None:
         """Return the surface point seen at a pixel, [3], world units; None where the background shows."""
+        camera = given_camera(camera)
         image = self.render(camera, time, at)
         column, row = int(math.floor(x)), int(math.floor(y))
         if not (0 <= column < camera.width and 0 <= row < camera.height) or float(image.alpha[row, column]) < 0.5:
@@ -361,8 +363,8 @@ class EditSession(Posing):
         scene = self.scene
         if bent is None:
             return scene.render(camera, time, background)  # type: ignore[arg-type]
-        color = torch.as_tensor(scene.background_color if background is None else background, dtype=torch.float32)
-        view = scene.normalisation.apply_camera(camera).to(scene.device)
+        color = given_color(scene.background_color if background is None else background)
+        view = scene.normalisation.apply_camera(given_camera(camera)).to(scene.device)
         posed = self.engine.normalised(time, bent)
         drawn = posed, view, color.to(scene.device)
         return render(*drawn, antialiased=scene.config.antialiased, depth_unit=scene.normalisation.scale)

@@ -30,6 +30,7 @@ from ..storage.files import read_text
 from ..storage.json_files import parse_json
 from ..types import Camera, Gaussians, Image
 from . import film_maker, page_maker
+from .arguments import given_camera, given_color
 from .frame_graph import FrameGraph
 from .validation import check_metadata, check_motion, check_settings, check_tensors, reason
 
@@ -201,7 +202,7 @@ class Scene:
         """Render the scene at ``time`` from a camera in world units.
 
         Args:
-            camera: on any device.
+            camera: on any device; arrays and lists of any kind of number are taken.
             time: clamped to [0, 1].
             background: colour in [0, 1]; None: ``background_color``.
 
@@ -211,10 +212,11 @@ class Scene:
 
         Raises:
             UserError: the time is non-finite.
+            ValueError: the camera or the background cannot be drawn.
         """
         time = clamped_time(time)
-        color = torch.as_tensor(self.background_color if background is None else background, dtype=torch.float32)
-        view = self.normalisation.apply_camera(camera)
+        color = given_color(self.background_color if background is None else background)
+        view = self.normalisation.apply_camera(given_camera(camera))
         if self.device.type == "cuda" and self.motion.takes_time_tensor:
             return self.frame_graph().render(view, time, color)
         posed = self.motion.gaussians_at(self.gaussians, time)
