@@ -77,8 +77,9 @@ def load_data(scene: Scene, options: Options) -> Dataset:
 
 def other_images(run: Path, dataset: Dataset) -> str | None:
     """Say that the images are not those that the run recorded for this split, or return None."""
-    from scgs_warp.data.thumbnails import differ, thumbnails
+    from scgs_warp.data.thumbnails import thumbnails
     from scgs_warp.storage import checkpoint
+    from scgs_warp.storage.recorded_images import differ
 
     recorded = checkpoint.read(run, ())[1].get("images")
     if not isinstance(recorded, dict) or not differ(recorded.get(dataset.split), thumbnails(dataset)):

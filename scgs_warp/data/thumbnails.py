@@ -5,8 +5,6 @@ Thumbnails do not depend on the folder, nor on how the files are compressed, and
 
 from __future__ import annotations
 
-from typing import Any
-
 import torch
 
 from ..errors import UserError
@@ -14,8 +12,6 @@ from .dataset import Dataset, spread
 
 IMAGES, SIDE = 8, 8
 """Number of images, and width and height of their thumbnails in pixels."""
-ALIKE = 3
-"""Largest difference, in levels of 255, between thumbnails of equal images: decoders and filters round differently."""
 
 
 def thumbnails(data: Dataset) -> str:
@@ -32,15 +28,3 @@ def thumbnails(data: Dataset) -> str:
         small = torch.nn.functional.adaptive_avg_pool2d(image.permute(2, 0, 1), SIDE)
         content += bytes((small.clamp(0.0, 1.0) * 255.0).round().to(torch.uint8).flatten().tolist())
     return content.hex()
-
-
-def differ(recorded: Any, found: str) -> bool:
-    """Return whether images differ from those of which thumbnails were recorded; False if either has none, as runs of
-    earlier versions."""
-    if not isinstance(recorded, str) or not recorded or not found:
-        return False
-    try:
-        then, now = bytes.fromhex(recorded), bytes.fromhex(found)
-    except ValueError:
-        return False
-    return len(then) != len(now) or any(abs(one - other) > ALIKE for one, other in zip(then, now))

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from ..errors import UserError
 from ..storage import checkpoint
+from ..storage.recorded_images import differ
 from ..types import Camera, Image
 from .scene import Scene
 
@@ -71,11 +72,15 @@ def load_mean(runs: Sequence[str | Path], device: str = "cpu") -> Scene:
         if any(run.samefile(before) for before in folders[:place]):
             raise UserError(f"{run}: is given twice; give runs with different seeds")
         same_cameras = scenes[place].overview == scenes[0].overview
-        if not same_cameras or _frames_of(run) != _frames_of(folders[0]):
+        (frames, images), (others, shown) = _frames_of(folders[0]), _frames_of(run)
+        if not same_cameras or others != frames or differ(images, shown):
             raise UserError(f"{run}: was trained on other frames than {folders[0]}; give runs of one data set")
     return scenes[0] if len(scenes) == 1 else MeanScene(scenes)
 
 
-def _frames_of(run: Path) -> str | None:
-    """Return the hash of the names, times and sizes of a run's training frames."""
-    return checkpoint.read(run, ())[1].get("frames")
+def _frames_of(run: Path) -> tuple[str | None, str]:
+    """Return the hash of the names, times and sizes of a run's training frames, and their thumbnails; "": unknown."""
+    recorded = checkpoint.read(run, ())[1]
+    images = recorded.get("images")
+    shown = images.get("train") if isinstance(images, dict) else None
+    return recorded.get("frames"), shown if isinstance(shown, str) else ""

@@ -9,9 +9,10 @@ import numpy as np
 
 from ..config.presets import FREE_TO_CHANGE, TrainConfig
 from ..data.dataset import Dataset
-from ..data.thumbnails import differ, thumbnails
+from ..data.thumbnails import thumbnails
 from ..errors import UserError
 from ..geometry.cameras import Overview, overview, places_and_directions
+from ..storage.recorded_images import differ
 from .scene_distance import depth_ahead
 
 SAME_CAMERAS = 0.02

@@ -11,7 +11,8 @@ from helpers.nerfstudio_files import write
 from helpers.tiny import tiny_dataset
 from scgs_warp.data import load
 from scgs_warp.data.dataset import Dataset
-from scgs_warp.data.thumbnails import IMAGES, SIDE, differ, thumbnails
+from scgs_warp.data.thumbnails import IMAGES, SIDE, thumbnails
+from scgs_warp.storage.recorded_images import differ
 
 
 def other(change) -> str:

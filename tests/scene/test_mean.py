@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from helpers.tiny import tiny_config, tiny_dataset
+from scgs_warp.data.dataset import Dataset
 from scgs_warp.errors import UserError
 from scgs_warp.scene.mean import MeanScene, load_mean
 from scgs_warp.scene.scene import Scene
@@ -51,12 +52,18 @@ def test_a_single_run_is_its_scene(runs):
 
 
 def test_runs_that_have_no_mean_are_refused(runs, tmp_path):
-    """Those of other frames, or of frames with the same names by other cameras, and a run with itself."""
+    """Those of other frames, of frames with the same names by other cameras or of something else, and a run with
+    itself."""
     data = tiny_dataset(6)
     moved = [dataclasses.replace(each.camera, viewmat=each.camera.viewmat.clone()) for each in data]
     for camera in moved:
         camera.viewmat[2, 3] += 1.0
-    others = {"fewer": data.subset(range(5)), "moved": data.with_cameras(moved)}
+    negative = [dataclasses.replace(frame, image=1.0 - frame.image) for frame in data]
+    others = {
+        "fewer": data.subset(range(5)),
+        "moved": data.with_cameras(moved),
+        "negative": Dataset(negative, folder=data.folder, split="train"),
+    }
     for name, other in others.items():
         fit(tiny_config(40), other, output=tmp_path / name)
         told = rf"{name}: was trained on other frames than .*seed-0; give runs of one data set"
