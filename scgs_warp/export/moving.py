@@ -19,6 +19,8 @@ from .segments import Course
 from .skeleton import AnimationMoment, extent_of, finite_rows, posed_gaussians
 from .tracks import build_tracks, read_points, write_tracks
 
+THINNEST = 1e-30
+"""Scale in place of 0, of which there is no logarithm."""
 COURSE_BYTES = 52
 """Memory of a Gaussian at a moment: position, rotation, scale and colour in float32."""
 
@@ -62,7 +64,7 @@ def export_fourdgs(
         for number, moment in enumerate(moments):
             posed = posed_gaussians(scene, session, moment)
             rows &= finite_rows(posed)
-            held = posed.means, posed.quats, posed.scales, 0.5 + SH_C0 * posed.sh_dc
+            held = posed.means, posed.quats, posed.scales.clamp_min(THINNEST), 0.5 + SH_C0 * posed.sh_dc
             frames.append([value.detach().cpu().numpy() for value in held])
             if number == 0:
                 opacities = posed.opacities.detach().cpu().numpy()

@@ -140,3 +140,12 @@ def test_a_gaussian_that_an_edit_moved_too_far_asks_for_less_of_the_edit(tmp_pat
     session.move("end", translation=(1e8, 0.0, 0.0))
     with pytest.raises(UserError, match="too far away for the format; move it less far if an edit put it there"):
         export_fourdgs(tmp_path / "a.4dgs", session.scene, session, even_moments(2, FPS), everything(session.scene))
+
+
+def test_scales_that_have_vanished_are_written(tmp_path):
+    scene = bar_scene(nodes=12, gaussians=60)
+    with torch.no_grad():
+        scene.gaussians.log_scales[:20, 0] = -200.0
+    assert (scene.gaussians_at(0.0).scales == 0.0).sum() == 20
+    file, decoded = written(tmp_path / "a.4dgs", scene, 3)
+    assert len(file.render_at(decoded, 0.0)["centers"]) == 60
