@@ -10,6 +10,7 @@ import torch
 
 from helpers.edit_scenes import figure_scene
 from helpers.editor_windows import Window, until
+from helpers.touch import Touch
 from scgs_warp.edit import EditSession
 from scgs_warp.geometry.cameras import orbit_camera
 from scgs_warp.rendering.render import render
@@ -83,4 +84,20 @@ def test_the_right_hand_is_raised_by_half_the_height_of_the_figure(browser, edit
     assert overlap >= 0.9 and (by_mouse & before).sum() / (by_mouse | before).sum() < 0.5, "and it has moved"
     rest = np.setdiff1d(np.arange(len(begin)), nodes)
     assert np.abs(places() - begin)[rest].max() < 0.05 * height, "the chest stays"
+    window.close()
+
+
+def test_a_pinch_that_begins_on_a_part_changes_the_view(browser, editor):
+    window = Window(browser, editor, has_touch=True)
+    window.still()
+    x, y = window.part_on_screen(window.lowest_limb())
+    fingers, distance = Touch(window.context, window.page), window.ask("player.orbit.distance")
+    fingers.at("touchStart", (x, y))
+    fingers.at("touchMove", (x + 1, y - 1))
+    fingers.at("touchStart", (x + 1, y - 1), (x + 60, y - 60))
+    fingers.at("touchMove", (x - 20, y + 20), (x + 90, y - 90))
+    fingers.at("touchEnd")
+    window.still()
+    assert window.ask("player.orbit.distance") < 0.9 * distance
+    until(lambda: window.ask("studio.link.state.unedited && !studio.link.state.undo"))
     window.close()

@@ -18,6 +18,7 @@ from PIL import Image
 
 from helpers.chromium import chromium, lose_context, restore_context
 from helpers.edit_scenes import bar_scene, rich_scene, tinted_scene
+from helpers.touch import Touch
 from scgs_warp.export.page import write_page
 from scgs_warp.export.request import ExportRequest
 from scgs_warp.export.run import export, write_still
@@ -318,12 +319,7 @@ def test_panning_keeps_what_is_under_the_pointer(browser, bar):
 def test_two_fingers_pinch(browser, bar):
     visit = Visit(browser, bar[1], has_touch=True)
     visit.still()
-    before, touch = visit.state(), visit.context.new_cdp_session(visit.page)
-
-    def send(kind: str, *points: tuple[float, float]) -> None:
-        fingers = [{"x": x, "y": y, "id": k} for k, (x, y) in enumerate(points)]
-        touch.send("Input.dispatchTouchEvent", {"type": kind, "touchPoints": fingers})
-
+    before, send = visit.state(), Touch(visit.context, visit.page).at
     send("touchStart", (200, 150), (260, 150))
     send("touchMove", (170, 150), (290, 150))
     send("touchEnd")

@@ -12,6 +12,7 @@ import pytest
 from helpers.chromium import chromium
 from helpers.edit_scenes import figure_scene
 from helpers.page_visits import Visit, psnr, until
+from helpers.touch import Touch
 from scgs_warp.edit import EditSession
 from scgs_warp.export.page import write_page
 from scgs_warp.export.page_edit import own_motion
@@ -210,4 +211,36 @@ def test_escape_and_the_button_take_back(browser, figure):
     visit.page.get_by_role("button", name="Settings").click()
     visit.page.get_by_role("button", name="Reset pose").click()
     assert not visit.ask("player.figure.posed") and visit.page.get_by_role("button", name="Reset pose").is_disabled()
+    visit.context.close()
+
+
+def test_a_pinch_that_begins_on_a_part_changes_the_view(browser, figure):
+    """Fingers of a hand never land at once; a finger that comes later leaves the pull alone."""
+    session, path = figure
+    visit = Visit(browser, path, "?paused&t=0", has_touch=True)
+    until(visit.idle)
+    x, y = place(visit, lowest_limb(session, visit))
+    fingers = Touch(visit.context, visit.page)
+    distance = visit.ask("player.orbit.distance")
+    fingers.at("touchStart", (x, y))
+    fingers.at("touchMove", (x + 1, y - 1))
+    assert visit.ask("player.hand.drag !== null")
+    fingers.at("touchStart", (x + 1, y - 1), (x + 60, y - 60))
+    fingers.at("touchMove", (x - 20, y + 20), (x + 90, y - 90))
+    fingers.at("touchEnd")
+    until(visit.idle)
+    assert visit.ask("player.orbit.distance") < 0.9 * distance
+    assert not visit.ask("player.figure.posed") and visit.ask("player.hand.past.length") == 0
+
+    visit.ask("player.orbit.reset(), player.changed()")
+    until(visit.idle)
+    fingers.at("touchStart", (x, y))
+    fingers.at("touchMove", (x + 10, y - 25))
+    visit.page.wait_for_timeout(600)
+    fingers.at("touchStart", (x + 10, y - 25), (30, 30))
+    fingers.at("touchMove", (x + 20, y - 50), (60, 60))
+    fingers.at("touchEnd")
+    until(visit.idle)
+    assert visit.ask("player.figure.posed") and visit.ask("player.orbit.distance") == distance
+    assert visit.problems == []
     visit.context.close()

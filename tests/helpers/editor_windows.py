@@ -33,9 +33,9 @@ def serve(scene: Scene, folder: Any) -> Editor:
 class Window:
     """One window with the editor in it."""
 
-    def __init__(self, browser: Any, editor: Editor, query: str = "", size: dict[str, int] = SIZE) -> None:
+    def __init__(self, browser: Any, editor: Editor, query: str = "", size: dict[str, int] = SIZE, **kind: Any) -> None:
         self.editor, self.problems = editor, []
-        self.context = browser.new_context(viewport=size)
+        self.context = browser.new_context(viewport=size, **kind)
         self.page = self.context.new_page()
         self.page.set_default_timeout(1e3 * PATIENCE)
         self.page.on("pageerror", lambda error: self.problems.append(str(error)))

@@ -4,6 +4,7 @@ const element = (id) => document.getElementById(id);
 const hex = (color) => "#" + color.map((v) => Math.round(255 * v).toString(16).padStart(2, "0")).join("");
 const numbers = (text) => [1, 3, 5].map((k) => parseInt(text.slice(k, k + 2), 16) / 255);
 const asked = new URLSearchParams(location.search); // of the page's address: ?noui, ?paused, ?t=SECONDS
+const PINCH = 400; // milliseconds within which a second finger makes a pull a gesture of the view
 const IDLE = 2500; // milliseconds without an input after which the bar hides while the scene plays
 
 class Clock {
@@ -154,7 +155,17 @@ function listenToPointers(player) {
     }
     player.changed();
   };
+  // A second finger soon after the first one took a part: both mean the view, and the part goes back.
+  const share = (event) => {
+    const drag = player.hand?.drag;
+    if (!drag || event.pointerType !== "touch" || drag.from.pointerType !== "touch") return;
+    if (drag.moved && event.timeStamp - drag.from.timeStamp > PINCH) return;
+    player.hand.cancel();
+    const { pointerId, clientX, clientY } = drag.latest ?? drag.from;
+    fingers.set(pointerId, { x: clientX, y: clientY });
+  };
   canvas.addEventListener("pointerdown", (event) => {
+    share(event);
     if (player.hand?.takes(event, fingers.size)) return; // it pulls a part of the scene
     canvas.setPointerCapture(event.pointerId);
     fingers.set(event.pointerId, { x: event.clientX, y: event.clientY });

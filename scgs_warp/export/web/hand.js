@@ -69,6 +69,7 @@ class Hand {
     if (event.pointerId !== drag.pointer) return;
     drag.moved ||= Math.hypot(event.clientX - drag.from.clientX, event.clientY - drag.from.clientY) > 3;
     if (!drag.moved) return;
+    drag.latest = event;
     drag.go(this.place(event));
     player.changed();
   }
