@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -281,6 +282,11 @@ def test_the_scene_stays_in_sight_on_the_smallest_phones(browser, editor):
     window = Window(browser, editor, size={"width": 320, "height": 568})
     window.still()
     window.page.get_by_role("button", name="Panel", exact=True).click()
+    marks = window.page.evaluate(
+        """[...document.querySelectorAll("#tracks .ruler span")].map((mark) => mark.getBoundingClientRect())
+        .filter(({ width }) => width).map(({ left, right }) => [left, right])"""
+    )
+    assert len(marks) > 2 and all(one[1] <= other[0] for one, other in pairwise(marks)), "marks do not overlap"
     for size in ({"width": 320, "height": 568}, {"width": 800, "height": 360}):
         window.page.set_viewport_size(size)
         window.still()
