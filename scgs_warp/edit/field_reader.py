@@ -39,13 +39,13 @@ def read_object(path: Path) -> dict[str, Any]:
 
 
 def parse_object(text: str, path: str) -> dict[str, Any]:
-    """Parse a text as a JSON object, also after the mark that editors of Windows put there; errors name ``path``.
+    """Parse a text as a JSON object; errors name ``path``.
 
     Raises:
         UserError: the text is not JSON, or not an object.
     """
     try:
-        content = parse_json(text.removeprefix("\ufeff"), parse_constant=_no_constant, object_pairs_hook=_unique)
+        content = parse_json(text, parse_constant=_no_constant, object_pairs_hook=_unique)
     except json.JSONDecodeError as error:
         where = f"line {error.lineno} column {error.colno}"
         raise UserError(f"{path}: not valid JSON, {where}: {error.msg}; correct it") from None

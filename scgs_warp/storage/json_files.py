@@ -14,13 +14,14 @@ from .files import read_text
 
 
 def parse_json(text: str | bytes, **hooks: Any) -> Any:
-    """Parse JSON as ``json.loads`` does, but raise ValueError for brackets that are nested too deeply.
+    """Parse JSON as ``json.loads`` does, also after the mark that editors of Windows put before a text, but raise
+    ValueError for brackets that are nested too deeply.
 
     Raises:
         ValueError: the text is not valid JSON; a ``json.JSONDecodeError`` where the position is known.
     """
     try:
-        return json.loads(text, **hooks)
+        return json.loads(text.removeprefix("\ufeff") if isinstance(text, str) else text, **hooks)
     except RecursionError:
         raise ValueError("nested too deeply") from None
 

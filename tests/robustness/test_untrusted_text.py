@@ -77,6 +77,14 @@ def test_a_scene_with_settings_that_are_no_file_is_refused(tmp_path):
     refusal(lambda: Scene.load(tmp_path / "run"), "config.json", "not a regular file")
 
 
+def test_settings_that_an_editor_of_windows_saved_are_read(tmp_path):
+    write_model("static", tmp_path / "run")
+    plain = Scene.load(tmp_path / "run").settings
+    settings = tmp_path / "run/config.json"
+    settings.write_text("\ufeff" + json.dumps({"seed": 7}), encoding="utf-8")
+    assert Scene.load(tmp_path / "run").settings == {"seed": 7} != plain
+
+
 NUMBERS_OF_TEXT = {
     "transform_matrix": ("frames", 0, "transform_matrix", 0, 0),
     "applied_transform": ("applied_transform",),
