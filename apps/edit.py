@@ -288,7 +288,7 @@ def main(args: list[str] | None) -> None:
         last = max((frame.at for frame in session.edit.keyframes), default=0.0)
         at = last if options.at is None else options.at
         which = ", the last keyframe" if options.at is None and session.edit.keyframes else ""
-        held, note = write_edited(options.export, session, at)
+        held, note = write_edited(options.export, session, session.scene_time(at), at)
         print(f"{options.export}: {held:,} Gaussians, {at:g} s into the film{which}{note}")
 
 

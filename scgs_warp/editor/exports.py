@@ -71,14 +71,22 @@ def export_film(editor: Host, fields: FieldReader) -> str:
 
 
 def export_ply(editor: Host, fields: FieldReader) -> str:
-    """Start to write the edited Gaussians at the moment shown."""
+    """Start to write the edited Gaussians at the moment shown, as ``edit.py --export`` does."""
+    from ..export.plain import pieces_of
+    from ..export.run import write_edited
+
     path, moment, session = _path(editor, fields, ".ply"), editor.model.moment(), _forked(editor)
 
     def work(advance: Advance) -> Path:
-        editor.worker.call(lambda: session.export_ply(path, moment.time, moment.at), patient=True)
+        def compute(action: Callable[[], Any]) -> Any:
+            result = editor.worker.call(action, patient=True)
+            advance()
+            return result
+
+        write_edited(path, session, moment.time, moment.at, compute)
         return path
 
-    editor.jobs.start(f"Gaussians {path.name}", 1, work)
+    editor.jobs.start(f"Gaussians {path.name}", pieces_of(session.scene) + 1, work)
     return path.name
 
 

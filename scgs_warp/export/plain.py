@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import copy
+import functools
 import math
+from collections.abc import Callable
 from dataclasses import replace
 from itertools import cycle, islice
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -44,18 +46,31 @@ class _View(NamedTuple):
     """[3, H, W]"""
 
 
-def plain_scene(scene: Scene) -> Scene:
+def at_once(action: Callable[[], Any]) -> Any:
+    """Call a function and return its result."""
+    return action()
+
+
+def pieces_of(scene: Scene) -> int:
+    """Return the number of calls by ``plain_scene`` of its ``compute``."""
+    return 0 if scene.gaussians.sharpness == 0.0 else VIEWS + STEPS
+
+
+def plain_scene(scene: Scene, compute: Callable[[Callable[[], Any]], Any] = at_once) -> Scene:
     """Return a scene of sharpness 0 that looks like ``scene``; a scene that has no sharpness is returned unchanged.
 
     Scales, opacities and base colours are fitted to images of ``scene`` from around and at different times, beginning
     with ``Gaussians.plain``. The result is bit-identical for the same scene. Gaussians that no view shows, and those
     whose fit is not finite, stay as ``Gaussians.plain`` makes them.
+
+    Args:
+        compute: calls a function and returns its result, so that another thread may compute.
     """
     gaussians, motion = scene.gaussians, scene.motion
     if gaussians.sharpness == 0.0:
         return scene
     scene.freeze_binding()
-    views = [_view(scene, index) for index in range(VIEWS)]
+    views = [compute(functools.partial(_view, scene, index)) for index in range(VIEWS)]
     background = torch.tensor(scene.background_color, device=scene.device)
     start = math.log(plain_scale(gaussians.sharpness))
     changes = {
@@ -64,17 +79,21 @@ def plain_scene(scene: Scene) -> Scene:
         "sh_dc": nn.Parameter(torch.zeros_like(gaussians.sh_dc)),
     }
     optimizer = Adam(changes, RATES)
+
+    def learn(step: int, view: _View) -> None:
+        with torch.no_grad():
+            posed = motion.gaussians_at(gaussians, view.time)
+        changed = _changed(posed, gaussians.opacity_logits.detach(), changes)
+        image, _ = draw(changed, view.camera, background, antialiased=scene.config.antialiased)
+        photometric_loss(image, view.truth)[0].backward()
+        for name, group in optimizer.groups.items():
+            group.rate = RATES[name] * log_linear(1.0, SETTLED, max(0, 2 * step - STEPS), STEPS)
+        optimizer.step()
+        optimizer.zero_grad()
+
     with progress(STEPS, "fitting Gaussians") as shown:
         for step, view in enumerate(islice(cycle(views), STEPS)):
-            with torch.no_grad():
-                posed = motion.gaussians_at(gaussians, view.time)
-            changed = _changed(posed, gaussians.opacity_logits.detach(), changes)
-            image, _ = draw(changed, view.camera, background, antialiased=scene.config.antialiased)
-            photometric_loss(image, view.truth)[0].backward()
-            for name, group in optimizer.groups.items():
-                group.rate = RATES[name] * log_linear(1.0, SETTLED, max(0, 2 * step - STEPS), STEPS)
-            optimizer.step()
-            optimizer.zero_grad()
+            compute(functools.partial(learn, step, view))
             shown.advance()
     made = copy.deepcopy(gaussians)
     made.sharpness = 0.0

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 import torch
@@ -32,7 +32,7 @@ from .glb import write_glb
 from .moving import export_fourdgs, export_tracks
 from .npz import write_npz
 from .part_rig import build_rig
-from .plain import plain_scene
+from .plain import at_once, plain_scene
 from .poster import edited_poster
 from .request import FRAME_FORMATS, SEQUENCES, ExportRequest, check_request, output_suffix
 from .sequence import ENDINGS, check_folder, write_sequence
@@ -133,14 +133,24 @@ def _export_still(request: ExportRequest, device: str) -> str:
     return f"{len(gaussians.means):,} Gaussians {when}{_clipping(request.output, clipped)}"
 
 
-def write_edited(path: Path, session: EditSession, at: float) -> tuple[int, str]:
-    """Write a moment of an edit's film, fitting Gaussians in place of sharp ones, as :func:`export` does with ``--at``.
+def write_edited(
+    path: Path,
+    session: EditSession,
+    time: float,
+    at: float | None,
+    compute: Callable[[Callable[[], Any]], Any] = at_once,
+) -> tuple[int, str]:
+    """Write a moment of an edit, fitting Gaussians in place of sharp ones, as :func:`export` does with ``--at``.
+
+    Args:
+        time, at: as for ``EditSession.gaussians_at``.
+        compute: as for ``plain_scene``; it is called once more than there.
 
     Returns:
         Number of Gaussians, and a note on clipped values.
     """
-    scene = plain_scene(session.scene)
-    gaussians = keep_finite(session.drawn_with(scene).gaussians_at(session.scene_time(at), at))
+    scene = plain_scene(session.scene, compute)
+    gaussians = compute(lambda: keep_finite(session.drawn_with(scene).gaussians_at(time, at)))
     clipped = write_still(path, gaussians, up=scene.overview.up, antialiased=scene.config.antialiased)
     return len(gaussians.means), _clipping(path, clipped)
 

@@ -22,7 +22,9 @@ from scgs_warp.edit.rotations import from_axis, rotate, to_matrix
 from scgs_warp.editor import Editor
 from scgs_warp.editor.app import MAX_WAITING
 from scgs_warp.editor.state import CURVE
+from scgs_warp.export import plain
 from scgs_warp.export.page_data import unpack
+from scgs_warp.export.run import write_edited
 from scgs_warp.formats.gaussian_ply import write_gaussian_ply
 
 pytest.importorskip("aiohttp", reason="the package aiohttp is not installed")
@@ -317,6 +319,20 @@ def test_files_are_written_offered_and_read(editor, page, tmp_path):
         assert sent.status == 200 and "attachment" in (sent.getheader("Content-Disposition") or "")
     for name in ("..%2Fx.json", "none.mp4", "x.py", ".autosave.json.lock"):
         assert get(editor.server.port, f"/file/{name}", Cookie=key(editor.server)).status == 404
+
+
+def test_gaussians_are_fitted_to_sharp_ones_as_edit_py_does(editor, page, tmp_path, monkeypatch):
+    monkeypatch.setattr(plain, "VIEWS", 2)
+    monkeypatch.setattr(plain, "STEPS", 4)
+    monkeypatch.setattr(editor.session.scene.gaussians, "sharpness", 0.25)
+    pull(editor, page)
+    page.ask("export_ply", name="fitted")
+    page.until(lambda: any(m.get("file") == "fitted.ply" for m in page.heard) and page.state["job"] is None)
+    moment, session = editor.model.moment(), editor.session.fork()
+    editor.worker.call(lambda: write_edited(tmp_path / "same.ply", session, moment.time, moment.at))
+    editor.worker.call(lambda: session.export_ply(tmp_path / "formula.ply", moment.time, moment.at))
+    fitted, same, formula = ((tmp_path / f"{name}.ply").read_bytes() for name in ("fitted", "same", "formula"))
+    assert fitted == same != formula
 
 
 def test_the_scene_has_parts_and_its_motion(editor):
