@@ -66,7 +66,7 @@ class Raster(Options):
 
 @dataclass(frozen=True)
 class Step(Options):
-    """Measure a training step of stage 2, with and without the ARAP term."""
+    """Measure a training step of the main stage, with and without the ARAP term."""
 
 
 @dataclass(frozen=True)

@@ -36,7 +36,7 @@ class GaussianParameters(nn.Module):
         *,
         opacity: float = 0.1,
         sh_degree: int = 3,
-        hyper_dim: int = 0,
+        hyper_columns: int = 0,
         shaded: bool = False,
         corrected: bool = False,
         sharpness: float = 0.0,
@@ -53,7 +53,7 @@ class GaussianParameters(nn.Module):
         self.sh_dc = nn.Parameter(sh_dc.clone())
         self.sh_rest = nn.Parameter(torch.zeros(count, (sh_degree + 1) ** 2 - 1, 3, device=device))
         # As in the official code, this differs from the control points' +1e-2, so that the distance has a gradient.
-        self.hyper = nn.Parameter(torch.full((count, hyper_dim), -1e-2, device=device))
+        self.hyper = nn.Parameter(torch.full((count, hyper_columns), -1e-2, device=device))
         self.shading = nn.Parameter(torch.zeros(count, SHADING_COLUMNS if shaded else 0, device=device))
         self.correctives = nn.Parameter(torch.zeros(count, CORRECTIVE_COLUMNS if corrected else 0, device=device))
 
@@ -61,7 +61,7 @@ class GaussianParameters(nn.Module):
     def empty(
         count: int,
         sh_count: int,
-        hyper_dim: int,
+        hyper_columns: int,
         shaded: bool,
         corrected: bool,
         device: torch.device | str,
@@ -69,7 +69,7 @@ class GaussianParameters(nn.Module):
     ) -> GaussianParameters:
         """Allocate ``count`` Gaussians to be filled from a checkpoint."""
         zeros = torch.zeros(count, 3, device=device)
-        options = {"hyper_dim": hyper_dim, "shaded": shaded, "corrected": corrected, "sharpness": sharpness}
+        options = {"hyper_columns": hyper_columns, "shaded": shaded, "corrected": corrected, "sharpness": sharpness}
         made = GaussianParameters(zeros, zeros, zeros, sh_degree=0, **options)
         made.sh_rest = nn.Parameter(torch.zeros(count, sh_count, 3, device=device))
         return made
@@ -122,7 +122,7 @@ def gaussians_from_points(
     colors: Tensor | None,
     *,
     sh_degree: int,
-    hyper_dim: int,
+    hyper_columns: int,
     scale: float = 1.0,
     shaded: bool = False,
     corrected: bool = False,
@@ -141,5 +141,5 @@ def gaussians_from_points(
     with one_piece():
         log_scales = (neighbor_distance(points) * scale).log()[:, None].repeat(1, 3)
     sh_dc = torch.zeros_like(points) if colors is None else (colors - 0.5) / SH_C0
-    options = {"sh_degree": sh_degree, "hyper_dim": hyper_dim, "shaded": shaded, "corrected": corrected}
+    options = {"sh_degree": sh_degree, "hyper_columns": hyper_columns, "shaded": shaded, "corrected": corrected}
     return GaussianParameters(points, log_scales, sh_dc, sharpness=sharpness, **options)

@@ -31,7 +31,7 @@ def test_neighbor_distance_is_that_of_three():
 def test_gaussians_from_points_activate_to_what_was_given():
     points = torch.tensor([[0.0, 0.0, 0.0], [2.0, 0.0, 0.0]])
     colors = torch.tensor([[0.2, 0.5, 0.9], [0.0, 1.0, 0.5]])
-    made = gaussians_from_points(points, colors, sh_degree=2, hyper_dim=4, scale=0.5).activate()
+    made = gaussians_from_points(points, colors, sh_degree=2, hyper_columns=4, scale=0.5).activate()
     assert torch.equal(made.means, points) and made.sh_rest.shape == (2, 8, 3) and not made.sh_rest.any()
     torch.testing.assert_close(made.scales, torch.ones(2, 3))
     assert made.quats.tolist() == [[1.0, 0.0, 0.0, 0.0]] * 2
@@ -58,6 +58,6 @@ def test_plain_gaussians_look_most_alike():
 
 
 def test_sharpness_reaches_every_kind_of_gaussians():
-    made = gaussians_from_points(torch.rand(5, 3), None, sh_degree=0, hyper_dim=0, sharpness=0.5)
+    made = gaussians_from_points(torch.rand(5, 3), None, sh_degree=0, hyper_columns=0, sharpness=0.5)
     assert made.sharpness == made.activate().sharpness == 0.5
     assert GaussianParameters.empty(2, 0, 0, False, False, "cpu").sharpness == 0.0

@@ -79,7 +79,7 @@ def figure(count: int, seed: int = SEED, motion: MotionConfig | None = None) -> 
         means,
         log_scales,
         (colors - 0.5) / SH_C0,
-        hyper_dim=own.hyper_columns,
+        hyper_columns=own.hyper_columns,
         shaded=own.has_shading,
         corrected=own.has_correctives,
     )
@@ -215,7 +215,7 @@ def _background(scene: Scene) -> str:
 
 
 def training_state(scene: Scene, arap: bool) -> TrainState:
-    """Put the scene into stage 2 of training: full harmonics, densification statistics, rates near 0.
+    """Put the scene into the main stage of training: full harmonics, densification statistics, rates near 0.
 
     With ``arap`` every step has the ARAP term (in training every fifth has it), since a median over steps with and
     without the term would show neither kind. The scene's motion stays in training mode.

@@ -157,7 +157,7 @@ def _this_module() -> Any:
 
 
 def step_rows(case: BenchCase) -> list[dict[str, Any]]:
-    """Measure training steps of stage 2 on images of the scene, without and (if any) with the ARAP term.
+    """Measure training steps of the main stage on images of the scene, without and (if any) with the ARAP term.
 
     On CUDA the whole is a recorded graph, so its stages are those of a step taken operation by operation.
     """

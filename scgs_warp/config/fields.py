@@ -67,7 +67,7 @@ class MotionConfig:
     films: one for about 250 frames. Neighbouring networks are blended where chunks meet. For control points and
     per-gaussian."""
     train_positions: bool = True
-    """Learn the rest positions of the control points in stage 2 (paper); the official code never moves them."""
+    """Learn the rest positions of the control points in the main stage (paper); the official code never moves them."""
     hyper_dim: int = bounded(1, 0, 64)
     """Number of hyper-coordinates appended to positions in the neighbour search. They separate parts that lie side by
     side and move apart, such as a shadow and the table on which it falls. The official code has eight, which begin
@@ -108,13 +108,13 @@ class MotionConfig:
 
     @property
     def hyper_columns(self) -> int:
-        """Number of hyper-coordinates of each Gaussian, the mask's logit included; 0 for the rival models, which have
+        """Number of hyper-coordinates of each Gaussian, the mask's logit included; 0 for the other models, which have
         no neighbours to find."""
         return self.hyper_dim + self.mask if self.model == "control-points" else 0
 
     @property
     def has_shading(self) -> bool:
-        """True if shading is on and the model is control-points: the rival models have no shading."""
+        """True if shading is on and the model is control-points: the other models have no shading."""
         return self.shading and self.model == "control-points"
 
     @property
@@ -145,7 +145,7 @@ class PretrainConfig:
     """Number of steps between two rounds of densification."""
     densify_by: Literal["share", "gradient"] = newer("share", before="share")
     """Choice of the spheres that are cloned. share: a fixed share of them. gradient: those whose gradient reaches
-    ``grad_threshold``, and otherwise as Gaussians in stage 2: split if they are large, pruned below
+    ``grad_threshold``, and otherwise as Gaussians in the main stage: split if they are large, pruned below
     ``densify.min_opacity``, with opacity resets (official code)."""
     clone_share: float = bounded(0.2, 0, 1)
     """Share of the spheres cloned in each round, until the cap: those with the largest gradients."""

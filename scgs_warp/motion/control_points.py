@@ -23,7 +23,16 @@ from .base import Motion, MotionStep, TrainingPose, network_rate
 from .chunks import ChunkedNetwork
 from .network import DeformationNetwork
 from .pose_track import PoseTrack
-from .rigidity import Graph, arap_times, arap_weight, build_graph, rigidity
+from .rigidity import (
+    Graph,
+    arap_times,
+    arap_weight,
+    build_graph,
+    graph_is_old,
+    graph_of_state,
+    graph_state,
+    rigidity,
+)
 from .tensor_states import Layers, TensorState, same_states, states_of
 
 WITHIN_REACH = 0.999
@@ -286,7 +295,8 @@ class ControlPoints(Motion):
         return MotionStep((time, *others), 0.0 if self.graph is None else weight)
 
     def refresh_due(self, step: int, config: TrainConfig) -> bool:
-        return step >= config.freeze and arap_weight(step, config.loss) > 0.0 and self._graph_is_old(step, config.loss)
+        compares = step >= config.freeze and arap_weight(step, config.loss) > 0.0
+        return compares and graph_is_old(self.graph, step, config.loss)
 
     def train_at(
         self,
@@ -306,11 +316,8 @@ class ControlPoints(Motion):
         return TrainingPose(posed, weight * rigidity(instants, self.graph))
 
     def refresh_graph(self, step: int, loss: LossConfig) -> None:
-        if self._graph_is_old(step, loss):
+        if graph_is_old(self.graph, step, loss):
             self.graph = build_graph(self.trajectories, loss, self.graph)
-
-    def _graph_is_old(self, step: int, loss: LossConfig) -> bool:
-        return self.graph is None or step % loss.arap_refresh < loss.arap_every
 
     def trajectories(self, times: Tensor) -> Tensor:
         """Return the control points [T, M, 3] at ``times`` [T]."""
@@ -331,10 +338,7 @@ class ControlPoints(Motion):
         return {**rates, "positions": positions, "log_radii": nodes, "hyper": hyper, "strength_logits": nodes}
 
     def extra_state(self) -> dict[str, Tensor]:
-        return (
-            {} if self.graph is None else {"graph.neighbors": self.graph.neighbors, "graph.weights": self.graph.weights}
-        )
+        return graph_state(self.graph)
 
     def load_extra_state(self, tensors: dict[str, Tensor]) -> None:
-        if "graph.neighbors" in tensors:
-            self.graph = Graph.of(tensors["graph.neighbors"], tensors["graph.weights"])
+        self.graph = graph_of_state(tensors, self.graph)

@@ -1,4 +1,4 @@
-"""4D-GS: features from multi-resolution planes over (x, y, z, t), decoded per Gaussian (a rival in the paper's Table
+"""4D-GS: features from multi-resolution planes over (x, y, z, t), decoded per Gaussian (compared in the paper's Table
 S2)."""
 
 from __future__ import annotations

@@ -74,6 +74,23 @@ def build_graph(
         return graph if before is None else before.replaced_by(graph)
 
 
+def graph_is_old(graph: Graph | None, step: int, loss: LossConfig) -> bool:
+    """Return True in the first step with the term after each ``arap_refresh`` steps, or if there is no graph yet."""
+    return graph is None or step % loss.arap_refresh < loss.arap_every
+
+
+def graph_state(graph: Graph | None) -> dict[str, Tensor]:
+    """Return what a checkpoint holds of a graph."""
+    return {} if graph is None else {"graph.neighbors": graph.neighbors, "graph.weights": graph.weights}
+
+
+def graph_of_state(tensors: dict[str, Tensor], present: Graph | None) -> Graph | None:
+    """Return the graph of a checkpoint, or the present one if the checkpoint holds none."""
+    if "graph.neighbors" not in tensors:
+        return present
+    return Graph.of(tensors["graph.neighbors"], tensors["graph.weights"])
+
+
 def momentary_graph(instants: Tensor, loss: LossConfig, before: Graph | None = None) -> Graph | None:
     """Find neighbours by place at the first of two ``instants`` [2, M, 3].
 

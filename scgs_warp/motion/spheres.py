@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from ..config.presets import LossConfig, TrainConfig
+from ..config.presets import TrainConfig
 from ..gaussians import GaussianParameters
 from ..runtime.device_copies import sent
 from ..runtime.environment import one_piece
@@ -16,7 +16,16 @@ from ..types import Gaussians
 from .base import Motion, MotionStep, TrainingPose, network_rate
 from .chunks import ChunkedNetwork
 from .network import DeformationNetwork
-from .rigidity import Graph, arap_times, build_graph, momentary_graph, rigidity
+from .rigidity import (
+    Graph,
+    arap_times,
+    build_graph,
+    graph_is_old,
+    graph_of_state,
+    graph_state,
+    momentary_graph,
+    rigidity,
+)
 
 
 class _Scales(torch.autograd.Function):
@@ -79,14 +88,14 @@ class Spheres(Motion):
             with torch.no_grad():
                 instants = positions_at(torch.tensor((time, *others)[-2:]))
             self.graph = momentary_graph(instants, config.loss, self.graph)
-        elif self._graph_is_old(step, config.loss):
+        elif graph_is_old(self.graph, step, config.loss):
             self.graph = build_graph(positions_at, config.loss, self.graph)
         weight = config.pretrain.arap_weight * config.loss.arap_every
         return MotionStep((time, *others), 0.0 if self.graph is None else weight)
 
     def refresh_due(self, step: int, config: TrainConfig) -> bool:
         moving = step >= config.pretrain.warm_up
-        old = config.pretrain.arap_by == "moment" or self._graph_is_old(step, config.loss)
+        old = config.pretrain.arap_by == "moment" or graph_is_old(self.graph, step, config.loss)
         return moving and self._compares(step, config) and old
 
     def train_at(
@@ -109,19 +118,13 @@ class Spheres(Motion):
         """Return True if the step has the regulariser."""
         return config.pretrain.arap_weight > 0 and step % config.loss.arap_every == 0
 
-    def _graph_is_old(self, step: int, loss: LossConfig) -> bool:
-        return self.graph is None or step % loss.arap_refresh < loss.arap_every
-
     def rates(self, step: int, config: TrainConfig) -> dict[str, float]:
         rate = network_rate(step, config.pretrain.warm_up, config.optim)
         rates = {name: rate for name, _ in self.named_parameters() if name.startswith("network.")}
         return {**rates, "log_radius": config.optim.scales}
 
     def extra_state(self) -> dict[str, Tensor]:
-        return (
-            {} if self.graph is None else {"graph.neighbors": self.graph.neighbors, "graph.weights": self.graph.weights}
-        )
+        return graph_state(self.graph)
 
     def load_extra_state(self, tensors: dict[str, Tensor]) -> None:
-        if "graph.neighbors" in tensors:
-            self.graph = Graph.of(tensors["graph.neighbors"], tensors["graph.weights"])
+        self.graph = graph_of_state(tensors, self.graph)

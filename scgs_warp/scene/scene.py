@@ -307,7 +307,7 @@ def scene_from(tensors: dict[str, Tensor], metadata: dict[str, Any], device: str
             count, rows["sh_rest"].shape[1], rows["hyper"].shape[1], shaded, corrected, "cpu", sharpness
         )
         gaussians.load_state_dict(rows)
-        columns = config.motion.hyper_dim + config.motion.mask
+        columns = config.motion.hyper_columns
         if metadata["motion"] == ControlPoints.name and gaussians.hyper.shape[1] != columns:
             raise ValueError(f"gaussians.hyper has {gaussians.hyper.shape[1]} columns, not {columns}")
         state = checkpoint.strip(tensors, "motion.")

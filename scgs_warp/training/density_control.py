@@ -86,8 +86,8 @@ def spheres_due(config: PretrainConfig, done: int) -> bool:
 
 
 def sphere_reset_due(config: TrainConfig, done: int) -> bool:
-    """Decide whether the spheres' opacities are reset after ``done`` steps of stage 1: at the interval of stage 2, if
-    spheres are densified by gradient."""
+    """Decide whether the spheres' opacities are reset after ``done`` steps of stage 1: at the interval of the main
+    stage, if spheres are densified by gradient."""
     pretrain, every = config.pretrain, config.densify.opacity_reset_every
     return pretrain.densify_by == "gradient" and done < pretrain.densify_until and done % every == 0
 

@@ -68,7 +68,7 @@ def initial_spheres(
         index = farthest_points(points, count)
     chosen = points[index]
     shown = None if pretrain.grey else colors[index]
-    gaussians = gaussians_from_points(chosen, shown, sh_degree=0, hyper_dim=0)
+    gaussians = gaussians_from_points(chosen, shown, sh_degree=0, hyper_columns=0)
     share = START_RADIUS if first_pose else 1.0
     radius = min(share * float(neighbor_distance(chosen).median()), largest)
     network = make_network(config.motion, heads_of(config.motion), config.seed).to(device)
@@ -134,8 +134,8 @@ def densify_spheres_by_gradient(
     extent: float,
     step: int,
 ) -> None:
-    """Clone or split the spheres whose mean gradient reaches ``pretrain.grad_threshold``, as Gaussians of stage 2, and
-    remove transparent ones, keeping between N_p and the cap.
+    """Clone or split the spheres whose mean gradient reaches ``pretrain.grad_threshold``, as Gaussians of the main
+    stage, and remove transparent ones, keeping between N_p and the cap.
 
     As all spheres have one size, a round either clones or splits. A split shrinks that size as much as the halves
     shrink the geometric mean of all sizes. Pruning by size would remove all spheres at once, so there is none.
@@ -223,7 +223,7 @@ def control_points_from_spheres(gaussians: GaussianParameters, spheres: Spheres,
 def initial_gaussians(
     config: TrainConfig, points: Tensor, colors: Tensor, spheres: tuple[GaussianParameters, Spheres] | None = None
 ) -> GaussianParameters:
-    """Make the Gaussians of stage 2 at ``points`` [P, 3] with ``colors`` [P, 3], or around the spheres."""
+    """Make the Gaussians of the main stage at ``points`` [P, 3] with ``colors`` [P, 3], or around the spheres."""
     gaussians = _unstretched(config, points, colors, spheres)
     gaussians.hyper.data[:, : config.motion.hyper_dim] *= config.motion.hyper_stretch
     return gaussians
@@ -234,7 +234,7 @@ def _unstretched(
 ) -> GaussianParameters:
     options: dict[str, Any] = {
         "sh_degree": config.sh_degree,
-        "hyper_dim": config.motion.hyper_columns,
+        "hyper_columns": config.motion.hyper_columns,
         "shaded": config.motion.has_shading,
         "corrected": config.motion.has_correctives,
         "sharpness": config.sharpness,

@@ -107,7 +107,7 @@ def learn_motion(motion: ControlPoints, seen: SeenMotion, resting: Tensor, confi
 def _carried(source: _Target, resting: Tensor, config: TrainConfig) -> GaussianParameters:
     """Make Gaussians at the points that move and those that do not; they get no gradients."""
     points = torch.cat([source.points, resting])
-    gaussians = gaussians_from_points(points, None, sh_degree=0, hyper_dim=config.motion.hyper_columns)
+    gaussians = gaussians_from_points(points, None, sh_degree=0, hyper_columns=config.motion.hyper_columns)
     gaussians.hyper.data[:, : config.motion.hyper_dim] *= config.motion.hyper_stretch
     return gaussians.requires_grad_(False)
 

@@ -151,7 +151,7 @@ class TrainState:
         return state
 
     def begin_main(self) -> None:
-        """Enter stage 2: spheres become control points, and Gaussians are made."""
+        """Enter the main stage: spheres become control points, and Gaussians are made."""
         assert isinstance(self.motion, Spheres)
         nodes, solid = self.config.motion.nodes, self.config.pretrain.solid_opacity
         thin_spheres(self.gaussians, self.gaussian_optimizer, self.motion, nodes, solid)
@@ -234,7 +234,7 @@ class TrainState:
         tensors.update({f"extra.{name}": value for name, value in self.motion.extra_state().items()})
         for name in ("grad_norm", "count", "max_radii"):
             tensors[f"stats.{name}"] = getattr(self.stats, name)
-        if self.stage == "pretrain":  # stage 2 starts from the spheres
+        if self.stage == "pretrain":  # the main stage starts from the spheres
             tensors["points"], tensors["colors"] = self.points, self.colors
         metadata = {
             **self.scene().metadata(),

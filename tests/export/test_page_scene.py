@@ -108,7 +108,7 @@ def test_quaternions_of_either_sign_are_the_same_rotations(sign):
     """Three components are stored, and the reader takes the fourth, the largest, for positive."""
     count = 40
     points = torch.randn(count, 3, generator=torch.Generator().manual_seed(0))
-    gaussians = gaussians_from_points(points, None, sh_degree=0, hyper_dim=0)
+    gaussians = gaussians_from_points(points, None, sh_degree=0, hyper_columns=0)
     quats = torch.randn(count, 4, generator=torch.Generator().manual_seed(1))
     gaussians.quats.data[:] = sign * quats
     _, values = unpack(pack({}, gaussian_columns(gaussians, torch.arange(count), 0)))

@@ -218,7 +218,7 @@ def case_turned_harmonics(d: Draw, device: str) -> None:
 def case_densify(d: Draw, device: str) -> None:
     """Any parameters and statistics: invalid Gaussians go, one stays, counts agree, the budget holds."""
     count = max(d.count(), 1)
-    made = dress(d.normal(count, 3), seed=d.seed % 1000, degree=1, hyper_dim=2, shaded=d.chance())
+    made = dress(d.normal(count, 3), seed=d.seed % 1000, degree=1, hyper_columns=2, shaded=d.chance())
     made = made.to(device)
     optimizer = Adam(dict(made.named_parameters()), dict.fromkeys(GaussianParameters.NAMES, 1e-3))
     for parameter in made.parameters():
@@ -261,7 +261,7 @@ def case_scene(d: Draw, device: str) -> None:
     name = d.pick(("control-points", "control-points", "static", "per-gaussian", "hexplane"))
     config = from_dict({"motion": {"model": name, "nodes": 20, "layers": 2, "width": 32, "skip": 1}})
     points, columns = bar_points(int(d.pick((1, 17, 60))), 0), config.motion.hyper_columns
-    made, motion = dress(points, shaded=d.chance(), hyper_dim=columns), motion_of(name).to(device)
+    made, motion = dress(points, shaded=d.chance(), hyper_columns=columns), motion_of(name).to(device)
     hit = d.rows(len(made))
     with torch.no_grad():
         for parameter in (made.means, made.quats, made.log_scales, made.opacity_logits, made.sh_dc, made.shading):

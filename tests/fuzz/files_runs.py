@@ -67,7 +67,7 @@ def write_model(model: str, folder: Path) -> None:
         with torch.no_grad():
             motion.positions.copy_(points[:12])
             motion.log_radii.fill_(-1.5)
-    made = dress(points, degree=1, shaded=masked, hyper_dim=config.motion.hyper_columns)
+    made = dress(points, degree=1, shaded=masked, hyper_columns=config.motion.hyper_columns)
     write_run(folder, Scene(made, motion, Normalisation.identity(), config, OVERVIEW))
 
 

@@ -75,13 +75,13 @@ def dress(
     seed: int = 3,
     degree: int = 3,
     shaded: bool = False,
-    hyper_dim: int = 0,
+    hyper_columns: int = 0,
     corrected: bool = False,
 ) -> GaussianParameters:
     """Opaque Gaussians of random colours."""
     generator = torch.Generator().manual_seed(seed)
     colors = torch.rand(len(points), 3, generator=generator)
-    fields = {"sh_degree": degree, "hyper_dim": hyper_dim, "shaded": shaded, "corrected": corrected}
+    fields = {"sh_degree": degree, "hyper_columns": hyper_columns, "shaded": shaded, "corrected": corrected}
     made = gaussians_from_points(points, colors, **fields)
     with torch.no_grad():
         made.opacity_logits.fill_(2.0)
@@ -118,7 +118,7 @@ def bar_scene(
         places = torch.cat([places, torch.tensor([stray])])
     motion = Swing(places, torch.full((len(places),), 0.12), template.network, config.motion)
     unit = Normalisation(np.array([0.5, -1.0, 0.25]), scale)
-    made = dress(points, shaded=shaded, hyper_dim=config.motion.hyper_columns, corrected=corrected)
+    made = dress(points, shaded=shaded, hyper_columns=config.motion.hyper_columns, corrected=corrected)
     if share is not None:
         with torch.no_grad():
             made.hyper[:, -1] = torch.tensor(share).logit()
@@ -160,7 +160,7 @@ def figure_scene(nodes: int = 256, points: int = 12000) -> tuple[Scene, np.ndarr
     places = surface[chosen]
     motion = Puppet(places, spacing(places) * 0.5, template.network, config.motion)
     motion.bones = [str(bone) for bone in bones[chosen.numpy()]]
-    made = dress(surface, degree=0, hyper_dim=config.motion.hyper_columns)
+    made = dress(surface, degree=0, hyper_columns=config.motion.hyper_columns)
     scene = Scene(made, motion, Normalisation.identity(), config, OVERVIEW)
     scene.motion.eval()
     scene.freeze_binding()

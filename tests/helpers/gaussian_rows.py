@@ -14,7 +14,7 @@ RATES = dict.fromkeys(GaussianParameters.NAMES, 1e-3)
 def make(count: int, device: str, seed: int = 0) -> tuple[GaussianParameters, Adam]:
     """``count`` opaque Gaussians at random points, with non-zero moments of all parameters."""
     points = torch.rand(count, 3, generator=torch.Generator().manual_seed(seed)).to(device)
-    gaussians = gaussians_from_points(points, None, sh_degree=1, hyper_dim=2)
+    gaussians = gaussians_from_points(points, None, sh_degree=1, hyper_columns=2)
     with torch.no_grad():
         gaussians.opacity_logits.fill_(2.0)
     optimizer = Adam(dict(gaussians.named_parameters()), RATES)

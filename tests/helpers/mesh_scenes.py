@@ -32,7 +32,7 @@ def ball_gaussians(
     normals = np.tile(unit, (len(balls), 1))
     colors = np.where(normals[:, 2:] > 0, (1.0, 0.0, 0.0), (0.0, 0.0, 1.0))
     places, shades = torch.from_numpy(points).float(), torch.from_numpy(colors).float()
-    made = gaussians_from_points(places, shades, sh_degree=0, hyper_dim=0)
+    made = gaussians_from_points(places, shades, sh_degree=0, hyper_columns=0)
     half = np.arccos(np.clip(normals[:, 2], -1, 1)) / 2  # turns z to the normal
     axis = np.column_stack([-normals[:, 1], normals[:, 0], np.zeros(len(normals))])
     axis /= np.maximum(np.linalg.norm(axis, axis=1, keepdims=True), 1e-12)

@@ -126,7 +126,7 @@ def test_a_step_trains_the_networks_of_its_times_only():
     config = tiny_config(60, motion={"chunks": 4}, loss={"arap": 0.0, "arap_end": 0.0})
     motion = chunked_motion(4)
     motion.train()
-    gaussians = gaussians_from_points(torch.randn(30, 3), None, sh_degree=0, hyper_dim=config.motion.hyper_columns)
+    gaussians = gaussians_from_points(torch.randn(30, 3), None, sh_degree=0, hyper_columns=config.motion.hyper_columns)
     trained_pose(motion, gaussians, 0.5, config.freeze, config).gaussians.means.sum().backward()
     learnt = [network_of(motion, chunk).head.weight.grad is not None for chunk in range(4)]
     assert learnt == [False, True, True, False]
@@ -189,7 +189,7 @@ def test_every_chunk_is_checked_when_a_scene_is_loaded():
     data, config = tiny_dataset(10), tiny_config(60, motion={"chunks": 5}, pretrain={"with_points": False})
     scene = TrainState.begin(config, data, "cpu").scene()
     scene.motion = chunked_motion(5)
-    gaussians = gaussians_from_points(torch.randn(30, 3), None, sh_degree=0, hyper_dim=config.motion.hyper_columns)
+    gaussians = gaussians_from_points(torch.randn(30, 3), None, sh_degree=0, hyper_columns=config.motion.hyper_columns)
     scene.gaussians = gaussians
     check_motion(scene, "run", 5)
     with torch.no_grad():

@@ -21,7 +21,7 @@ def posed(mask: bool, logit: float, seed: int, corrected: bool = False):
     assert isinstance(motion, ControlPoints)
     motion.positions.data[:] = torch.rand(16, 3, generator=random)
     points = torch.rand(30, 3, generator=random)
-    gaussians = gaussians_from_points(points, None, sh_degree=0, hyper_dim=int(mask), corrected=corrected)
+    gaussians = gaussians_from_points(points, None, sh_degree=0, hyper_columns=int(mask), corrected=corrected)
     gaussians.hyper.data[:] = logit
     gaussians.quats.data[:] = -torch.randn(30, 4, generator=random)
     turn = torch.tensor([math.cos(0.3), 0.0, 0.0, math.sin(0.3)]).expand(16, 4).contiguous()

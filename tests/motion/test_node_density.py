@@ -18,7 +18,7 @@ def motion_and_gaussians(counts: list[int]):
     network = make_network(config, heads_of(config), 0)
     motion = ControlPoints(positions, torch.full((len(counts),), 0.2), network, config)
     points = positions.repeat_interleave(torch.tensor(counts), dim=0)
-    gaussians = gaussians_from_points(points, None, sh_degree=0, hyper_dim=0)
+    gaussians = gaussians_from_points(points, None, sh_degree=0, hyper_columns=0)
     optimizer = motion.optimizer(tiny_config())
     assert optimizer is not None
     return motion, optimizer, gaussians, torch.ones(len(points))
@@ -49,7 +49,7 @@ def test_control_points_clone_where_the_image_pulls_and_idle_ones_go(device):
     motion = motion.to(device)
     optimizer = motion.optimizer(tiny_config())
     assert optimizer is not None
-    gaussians = gaussians_from_points(positions[:6] + 0.01, None, sh_degree=0, hyper_dim=0)
+    gaussians = gaussians_from_points(positions[:6] + 0.01, None, sh_degree=0, hyper_columns=0)
     gradient = torch.zeros(6, device=device)
     gradient[2] = 1.0
     cloned, pruned = adapt_control_points(motion, optimizer, gaussians, gradient, grad_threshold=0.5)

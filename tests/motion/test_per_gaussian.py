@@ -15,7 +15,7 @@ def test_residuals_begin_after_the_static_phase(device):
     motion = build_motion("per-gaussian", config).to(device)
     assert isinstance(motion, PerGaussian)
     points = torch.rand(12, 3, generator=torch.Generator().manual_seed(0)).to(device)
-    gaussians = gaussians_from_points(points, None, sh_degree=0, hyper_dim=0)
+    gaussians = gaussians_from_points(points, None, sh_degree=0, hyper_columns=0)
     with torch.no_grad():
         motion.network.head.bias.copy_(torch.arange(1.0, 11.0))
     rest = gaussians.activate()

@@ -17,7 +17,7 @@ CONFIG = tiny_config(60, pretrain={"steps": 20, "warm_up": 6})
 
 def model(device: str):
     points = torch.rand(40, 3, generator=torch.Generator().manual_seed(0)).to(device)
-    gaussians = gaussians_from_points(points, None, sh_degree=0, hyper_dim=0)
+    gaussians = gaussians_from_points(points, None, sh_degree=0, hyper_columns=0)
     spheres = Spheres(make_network(CONFIG.motion, heads_of(CONFIG.motion), 0), 0.25).to(device)
     with torch.no_grad():
         spheres.network.head.weight.normal_(std=0.3, generator=torch.Generator(device).manual_seed(1))

@@ -13,7 +13,7 @@ def test_gaussians_stay():
     config = tiny_config(20)
     motion = build_motion("static", config)
     assert isinstance(motion, Static) and not motion.moves and motion.optimizer(config) is None
-    gaussians = gaussians_from_points(torch.rand(5, 3), None, sh_degree=1, hyper_dim=0)
+    gaussians = gaussians_from_points(torch.rand(5, 3), None, sh_degree=1, hyper_columns=0)
     rest = gaussians.activate()
     for time in (0.0, 0.5, torch.tensor([1.0])):
         posed = motion.gaussians_at(gaussians, time)

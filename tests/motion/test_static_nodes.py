@@ -11,7 +11,7 @@ from scgs_warp.types import Pose
 
 def cloud(device: str, count: int = 300):
     points = torch.rand(count, 3, generator=torch.Generator().manual_seed(0)).to(device)
-    gaussians = gaussians_from_points(points, None, sh_degree=0, hyper_dim=0)
+    gaussians = gaussians_from_points(points, None, sh_degree=0, hyper_columns=0)
     with torch.no_grad():
         gaussians.opacity_logits.fill_(2.0)
     return gaussians

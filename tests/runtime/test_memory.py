@@ -176,7 +176,7 @@ def test_all_frames_of_a_gif_are_planned(monkeypatch: pytest.MonkeyPatch):
 
 
 def test_gaussians_grow_as_far_as_memory_allows(monkeypatch: pytest.MonkeyPatch):
-    gaussians = gaussians_from_points(torch.rand(1000, 3), None, sh_degree=3, hyper_dim=0)
+    gaussians = gaussians_from_points(torch.rand(1000, 3), None, sh_degree=3, hyper_columns=0)
     allow(monkeypatch, 10 * GIB)
     assert density_control.affordable_count(gaussians, 10**9) == 10**9  # twice as many fit: more is for later to ask
     allow(monkeypatch, 2**20)

@@ -96,7 +96,7 @@ def test_random_backgrounds_over_data_on_white():
 
 
 def test_random_data_has_another_background_at_every_step():
-    """Data whose background is ``random`` asks for it itself, also in stage 2."""
+    """Data whose background is ``random`` asks for it itself, also in the main stage."""
     made = frames()
     data = Dataset(list(made.frames), folder=made.frames.folder, split="train", background="random")
     made = Frames(data, Normalisation.identity(), tiny_config(100), "cpu")
