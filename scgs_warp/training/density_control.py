@@ -157,7 +157,7 @@ def visible_gaussians(state: TrainState, frames: Frames) -> Tensor | None:
     if config.least_views > 1 and count == len(frames) >= config.least_views:
         keep &= (seen.views >= config.least_views) | seen.most.isinf()
     if config.clear_distance > 0.0:
-        keep &= seen.nearest >= config.clear_distance * nearest_content(frames.frames, state.normalisation)
+        keep &= seen.nearest >= config.clear_distance * nearest_content(frames.data, state.normalisation)
     if done == config.until:
         keep &= ~faintest(seen.most, config.faint_share)
     return keep

@@ -91,7 +91,7 @@ class Frames:
         Args:
             stereo: depth of frames without depth maps.
         """
-        self.frames = data
+        self.data = data
         self.config, self.device = config, torch.device(device)
         self.views = [normalisation.apply_camera(frame.camera) for frame in data.entries]
         """Normalised cameras, on the host."""
@@ -106,10 +106,10 @@ class Frames:
         self.depths: FrameDepths = stereo if stereo is not None and not maps.available else maps
         self._parts: dict[tuple[int, bool], Parts] = {}
         self._order: tuple[tuple[int, int], list[int]] = ((-1, 0), [])
-        self.by_time = sorted(range(len(self.frames)), key=lambda i: data.entries[i].time)
+        self.by_time = sorted(range(len(self.data)), key=lambda i: data.entries[i].time)
 
     def __len__(self) -> int:
-        return len(self.frames)
+        return len(self.data)
 
     def index_at(self, step: int, progressive: bool, view: int = 0) -> int:
         """Return the index of the frame of this step's ``view``.
@@ -120,14 +120,14 @@ class Frames:
                 every other view is one of the newest 20 %, so that the spheres follow a moving limb before views of its
                 earlier positions make them transparent.
         """
-        first, allowed, number = 0, len(self.frames), view_number(step, self.config, view)
+        first, allowed, number = 0, len(self.data), view_number(step, self.config, view)
         if progressive:
             pretrain = self.config.pretrain
             by_frame = pretrain.progressive_by == "frame"
             added = step / pretrain.progressive_every if by_frame else step // pretrain.progressive_every
             allowed = min(allowed, max(1, round(PROGRESSIVE_SHARE * (1.0 + added) * allowed)))
-            if by_frame and number % 2 and allowed < len(self.frames):
-                first = max(0, allowed - max(1, round(PROGRESSIVE_SHARE * len(self.frames))))
+            if by_frame and number % 2 and allowed < len(self.data):
+                first = max(0, allowed - max(1, round(PROGRESSIVE_SHARE * len(self.data))))
         count = allowed - first
         epoch, position = divmod(number, count)
         if self._order[0] != (epoch, count):
@@ -156,9 +156,9 @@ class Frames:
         """
         try:
             if halved:
-                found = self.frames.cache.get((self, index), lambda: _half(self.frames[index]))
+                found = self.data.cache.get((self, index), lambda: _half(self.data[index]))
             else:
-                frame = self.frames[index]
+                frame = self.data[index]
                 found = Pixels(frame.image, frame.alpha, frame.mask)
         except UserError as error:
             raise FrameError(str(error)) from error
@@ -168,10 +168,8 @@ class Frames:
     def expect(self, step: int, progressive: bool, view: int = 0) -> None:
         """Start to read the frame of this step's ``view`` in the background, unless it is in memory."""
         index = self.index_at(step, progressive, view)
-        if (self, index) not in self.frames.cache and not any(
-            self.images.hold((index, half)) for half in (False, True)
-        ):
-            self.frames.expect(index)
+        if (self, index) not in self.data.cache and not any(self.images.hold((index, half)) for half in (False, True)):
+            self.data.expect(index)
 
     def view(self, index: int, step: int, random_background: bool, sought: bool, view: int = 0) -> Loaded:
         """Load the images of this step's ``view``. A file whose images are on the device is not read.

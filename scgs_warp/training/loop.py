@@ -116,7 +116,7 @@ def fit(
             try:
                 check_replicas(state)
                 _train(state, frames, folder, test, bar, stop, watcher)
-                refuse_empty(state, frames.frames, folder.path)
+                refuse_empty(state, frames.data, folder.path)
             except ProcessLost as lost:
                 raise _process_lost(state, folder, lost) from lost
         state.motion.eval()
@@ -239,10 +239,10 @@ def _train(
         if stopping:
             _stop(state, bar)
         if state.step % COMPARE_EVERY == 0 and not last:
-            empty = empty + 1 if shows_nothing(state.scene(), frames.frames) else 0
+            empty = empty + 1 if shows_nothing(state.scene(), frames.data) else 0
             if empty == MOST_EMPTY:
                 state.save(folder.path)
-                refuse_empty(state, frames.frames, folder.path)
+                refuse_empty(state, frames.data, folder.path)
 
 
 def _perhaps_again(

@@ -86,7 +86,7 @@ def try_again(
     Raises:
         UserError: an image is no longer readable, or the processes of a group differ.
     """
-    second = TrainState.begin(second_config(state.config), frames.frames, str(frames.device))
+    second = TrainState.begin(second_config(state.config), frames.data, str(frames.device))
     second.group = state.group
     ordered = copy.copy(frames)  # the same images in the second try's order
     ordered.config = second.config
@@ -107,9 +107,9 @@ def try_again(
         second.step += 1
         go_on(second)
     check_replicas(second)
-    before, after = shown_psnr(state, frames.frames), shown_psnr(second, frames.frames)
+    before, after = shown_psnr(state, frames.data), shown_psnr(second, frames.data)
     better, reason = after > before + LEAST_GAIN, ""
-    if not better and is_one_piece(frames.frames):
+    if not better and is_one_piece(frames.data):
         torn = torn_by(state), torn_by(second)
         most, less = (MOST_LOSS, LESS) if torn[0] > TORN else (CHANCE, FAR_LESS)
         better = after > before - most and torn[1] < less * torn[0]

@@ -86,7 +86,7 @@ class TrainState:
         gaussians: GaussianParameters,
         motion: Motion,
         normalisation: Normalisation,
-        rig: Overview,
+        overview: Overview,
         extent: float,
         points: Tensor,
         colors: Tensor,
@@ -97,7 +97,7 @@ class TrainState:
         step: int = 0,
         data: Dataset | None = None,
     ) -> None:
-        self.config, self.normalisation, self.overview = config, normalisation, rig
+        self.config, self.normalisation, self.overview = config, normalisation, overview
         self.extent, self.points, self.colors = extent, points, colors
         self.stage: Stage = stage
         self.step, self.fingerprint = step, fingerprint
@@ -128,13 +128,13 @@ class TrainState:
     @staticmethod
     def begin(config: TrainConfig, data: Dataset, device: str) -> TrainState:
         """Make the state at step 0."""
-        normalisation, view, _ = place(data)
+        normalisation, overview, _ = place(data)
         config = resolve_auto(config, data)
         initial = _initial_points(config, data, normalisation)
         points, colors = initial.points.to(device), initial.colors.to(device)
         # Cameras that stand still have no extent; the extent of the content is used instead.
         extent = max(data.extent * normalisation.scale, COMMON_RADIUS)
-        rest = (normalisation, view, extent, points, colors)
+        rest = (normalisation, overview, extent, points, colors)
         identity = {"fingerprint": data.fingerprint, "frames": len(data), "data": data}
         if config.pretrain_steps > 0:
             wide = THICKEST * half_thickness(data, normalisation) if config.pretrain.silhouette > 0 else math.inf

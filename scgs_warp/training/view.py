@@ -117,7 +117,7 @@ def prepare(state: TrainState, frames: Frames, view: int = 0) -> View:
     loaded = frames.view(index, state.step, random_background, seeks_silhouettes(state), view)
     later, next_view = divmod(view + (1 if state.group is None else state.group.size), config.batch)
     frames.expect(step + later, progressive, next_view)
-    time = noisy_time(frames.frames.entries[index].time, state, len(frames), view)
+    time = noisy_time(frames.data.entries[index].time, state, len(frames), view)
     plan = state.motion.plan(state.gaussians, time, step, config, view)
     random = generator(config.seed, 45, view_number(state.step, config, view))
     sample = None if loaded.silhouette is None else loaded.silhouette.sample(random)

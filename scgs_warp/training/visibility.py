@@ -41,7 +41,7 @@ def seen_by(state: TrainState, frames: Frames, indices: list[int], least: float)
         camera = frames.views[index].to(state.device)
         with torch.no_grad():
             camera = state.cameras.apply(camera, index) if state.refines_cameras else camera
-            posed = state.motion.gaussians_at(state.gaussians, frames.frames.entries[index].time)
+            posed = state.motion.gaussians_at(state.gaussians, frames.data.entries[index].time)
         weights, in_view = view_contributions(posed, camera, state.config.antialiased)
         torch.maximum(most, weights, out=most)
         views += weights >= least

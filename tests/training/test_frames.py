@@ -27,8 +27,8 @@ def test_every_epoch_sees_every_frame_once_in_another_order():
 def test_progressive_starts_with_the_first_fifth_and_grows_to_all():
     made = frames(pretrain={"progressive_every": 50})
     windows = [range(start, start + 10) for start in (0, 50, 200)]
-    seen = [[made.frames[made.index_at(step, True)].time for step in window] for window in windows]
-    times = sorted(frame.time for frame in made.frames)
+    seen = [[made.data[made.index_at(step, True)].time for step in window] for window in windows]
+    times = sorted(frame.time for frame in made.data)
     assert set(seen[0]) == set(times[:2])
     assert max(seen[1]) in times[3:5] and min(seen[1][1::2]) >= times[2], "every other step looks at the newest fifth"
     assert set(seen[2]) == set(times)
@@ -37,9 +37,9 @@ def test_progressive_starts_with_the_first_fifth_and_grows_to_all():
 def test_progressive_by_fifths_adds_them_at_once():
     """As in the supplement: no frame of the next fifth before the interval ends, and all frames equally often."""
     made = frames(pretrain={"progressive_every": 50, "progressive_by": "fifth"})
-    times = sorted(frame.time for frame in made.frames)
+    times = sorted(frame.time for frame in made.data)
     for window, count in ((range(0, 50), 2), (range(50, 100), 4), (range(152, 200), 8), (range(200, 250), 10)):
-        seen = [made.frames[made.index_at(step, True)].time for step in window]
+        seen = [made.data[made.index_at(step, True)].time for step in window]
         assert set(seen) == set(times[:count])
         assert max(seen.count(time) for time in set(seen)) - min(seen.count(time) for time in set(seen)) <= 2
 
@@ -47,7 +47,7 @@ def test_progressive_by_fifths_adds_them_at_once():
 def test_random_background_is_under_the_image_alone():
     made = frames()
     _, background, truth, mask, _ = made.view(3, 7, True, False)
-    alpha, plain = made.frames[3].alpha, made.view(3, 7, False, False).truth
+    alpha, plain = made.data[3].alpha, made.view(3, 7, False, False).truth
     assert mask is None
     assert torch.allclose(truth, plain + (1 - alpha) * background[:, None, None])
     assert torch.equal(truth, made.view(3, 7, True, False).truth), "the same step gives the same background"
@@ -76,8 +76,8 @@ def test_small_images_and_masks_at_half_size():
     made = frames(64, half_size=10)
     mask = torch.ones(64, 64, dtype=torch.bool)
     mask[10, 11] = False
-    masked = [dataclasses.replace(frame, mask=mask if index == 1 else None) for index, frame in enumerate(made.frames)]
-    made.frames = Dataset(masked, folder=made.frames.folder, split="train")
+    masked = [dataclasses.replace(frame, mask=mask if index == 1 else None) for index, frame in enumerate(made.data)]
+    made.data = Dataset(masked, folder=made.data.folder, split="train")
     half = made.view(1, 0, False, False).mask
     assert half is not None and not half[5, 5] and int((~half).sum()) == 1
 
@@ -98,7 +98,7 @@ def test_random_backgrounds_over_data_on_white():
 def test_random_data_has_another_background_at_every_step():
     """Data whose background is ``random`` asks for it itself, also in the main stage."""
     made = frames()
-    data = Dataset(list(made.frames), folder=made.frames.folder, split="train", background="random")
+    data = Dataset(list(made.data), folder=made.data.folder, split="train", background="random")
     made = Frames(data, Normalisation.identity(), tiny_config(100), "cpu")
     seen = [made.view(3, step, False, False) for step in (7, 8)]
     for view in seen:
@@ -110,10 +110,10 @@ def test_random_data_has_another_background_at_every_step():
 def test_progressive_by_frame_adds_them_one_by_one():
     """Of ten frames one more every 25 steps; steps with odd numbers look at the newest fifth, the others at all."""
     made = frames(pretrain={"progressive_every": 50})
-    times = sorted(frame.time for frame in made.frames)
+    times = sorted(frame.time for frame in made.data)
 
     def seen(steps: range) -> set[float]:
-        return {made.frames[made.index_at(step, True)].time for step in steps}
+        return {made.data[made.index_at(step, True)].time for step in steps}
 
     for start, count in ((14, 3), (40, 4), (64, 5), (90, 6), (114, 7)):
         even, odd = seen(range(start, start + 22, 2)), seen(range(start + 1, start + 22, 2))

@@ -37,7 +37,7 @@ def begun(device: str, **changes) -> tuple[TrainState, Frames]:
 
 def move_away(state: TrainState, frames: Frames) -> None:
     """Move all Gaussians behind some camera and beside the others."""
-    cameras = [state.normalisation.apply_camera(camera) for camera in frames.frames.cameras]
+    cameras = [state.normalisation.apply_camera(camera) for camera in frames.data.cameras]
     outward = torch.stack([camera.position for camera in cameras]).mean(0)
     with torch.no_grad():
         state.gaussians.means.add_((AWAY * outward / outward.norm()).to(state.device))
@@ -78,7 +78,7 @@ def test_gaussians_that_no_view_shows_are_drawn_back_from_the_second_step_on(awa
 def test_a_step_of_several_views_draws_back_at_once():
     state, frames = begun("cpu", batch=2)
     move_away(state, frames)
-    assert shows_nothing(state.scene(), frames.frames)
+    assert shows_nothing(state.scene(), frames.data)
     before = distance(state)
     training_step(state, frames)
     assert distance(state) < before
@@ -91,7 +91,7 @@ def test_a_resumed_run_draws_back_at_the_same_steps(tmp_path):
     training_step(state, frames)
     state.step += 1
     state.save(tmp_path)
-    resumed = TrainState.resume(tmp_path, state.config, frames.frames, "cpu")
+    resumed = TrainState.resume(tmp_path, state.config, frames.data, "cpu")
     assert resumed.recalls == state.recalls == Window(2, 50)
 
 

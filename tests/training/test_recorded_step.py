@@ -225,7 +225,7 @@ def test_a_loss_that_is_not_finite_adds_no_statistics(device):
 
     def spoilt(device: str) -> tuple[TrainState, Frames]:
         state, frames = begin(device)
-        frames.frames[2].image[:4] = float("nan")
+        frames.data[2].image[:4] = float("nan")
         return state, frames
 
     plain, recorded = spoilt(device), spoilt(device)
