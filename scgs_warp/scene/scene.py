@@ -83,11 +83,13 @@ class Scene:
             The scene of the newest checkpoint, ready to render.
 
         Raises:
-            UserError: the checkpoint is missing or damaged, training has not reached its second stage, or there is no
+            UserError: the checkpoint is missing or damaged, training has not reached its main stage, or there is no
                 such device.
         """
         check_device(device)
         folder = Path(run)
+        if folder.is_file():
+            raise UserError(f"{folder}: is a file; give the folder of the run, such as {folder.parent}")
         if not folder.is_dir():
             raise UserError(f"{folder}: no such run directory; apps/train.py --output makes one")
         tensors, metadata = checkpoint.read(folder, ("gaussians.", "motion."))

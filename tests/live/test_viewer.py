@@ -99,6 +99,9 @@ def test_a_run_is_shown_again_when_its_checkpoint_changes(view, tmp_path, monkey
 
 
 def test_what_cannot_be_shown_is_refused(view, tmp_path):
+    (tmp_path / "checkpoint.safetensors").touch()
+    with pytest.raises(UserError, match=f"is a file; give the folder of the run, such as {tmp_path}"):
+        view_run(tmp_path / "checkpoint.safetensors", view, "cpu")
     with pytest.raises(UserError, match="no such run directory"):
         view_run(tmp_path / "missing", view, "cpu")
     with pytest.raises(UserError, match="no such file"):
