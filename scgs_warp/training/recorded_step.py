@@ -43,10 +43,9 @@ SLOT_BYTES = 8 + 64
 """Number of bytes that a pair takes in addition to the lists of an image without gradients."""
 
 
-MOST_FAILURES = 3
-"""Number of failed recordings of one kind of steps after which that kind is not recorded."""
-RETRY_AFTER = 500
-"""Number of steps from a failed recording to the next of its kind: the cause may pass, such as another program that
+RETRY_AFTER = 20, 500, 500
+"""Number of steps from each failed recording of one kind of steps to the next attempt; that kind is not recorded after
+one failure more. The cause may pass: autograd's graph of an earlier step that still lives, or another program that
 compiles the same kernels."""
 
 
@@ -173,7 +172,7 @@ class RecordedSteps:
     def _submit(self, update: RecordedUpdate, step: _Step) -> None:
         before = update.recordings
         waits = step.number < self._records_from.get(step.key, 0)
-        record = self._failures[step.key] < MOST_FAILURES and not waits
+        record = self._failures[step.key] <= len(RETRY_AFTER) and not waits
         if record:
             update.failure = None
         report, picture, kind = update.take(step.view, step.numbers, step.key, self.capacity, record)
@@ -193,12 +192,14 @@ class RecordedSteps:
         self._pending.append(_Submitted(step, kind, picture, report, done))
 
     def _note_failure(self, failure: str, step: _Step) -> None:
-        self._errors[step.key], self._records_from[step.key] = failure, step.number + RETRY_AFTER
         self._failures[step.key] += 1
-        last = self._failures[step.key] >= MOST_FAILURES
-        if last not in self._told:  # once each
+        self._errors[step.key], count = failure, self._failures[step.key]
+        last = count > len(RETRY_AFTER)
+        if not last:
+            self._records_from[step.key] = step.number + RETRY_AFTER[count - 1]
+        if count > 1 and last not in self._told:  # once each; most causes have passed by the second attempt
             self._told.add(last)
-            again = "" if last else f"; next attempt in {RETRY_AFTER} steps"
+            again = "" if last else f"; next attempt in {RETRY_AFTER[count - 1]} steps"
             reason = failure.splitlines()[0]
             self._tell(f"some steps are not recorded as a CUDA graph, so they take longer: {reason}{again}")
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable
 from typing import Any
 
@@ -30,7 +31,7 @@ def recordings_that_fail(device, monkeypatch, fails: Callable[[int, Any], bool],
         self.forget_recordings()
 
     monkeypatch.setattr(RecordedUpdate, "_record", refuse)
-    monkeypatch.setattr(recorded_step, "RETRY_AFTER", 12)
+    monkeypatch.setattr(recorded_step, "RETRY_AFTER", (12, 14))
     steps = RecordedSteps(state, frames, said.append)
     for _ in range(steps_taken):
         steps.take()
@@ -41,16 +42,27 @@ def recordings_that_fail(device, monkeypatch, fails: Callable[[int, Any], bool],
 
 def test_a_failed_recording_is_tried_again(device, monkeypatch):
     """The cause may have passed: one failure must not slow the whole run."""
-    steps, attempts, said = recordings_that_fail(device, monkeypatch, lambda number, key: number < 2, 60)
+    failed: Counter[Any] = Counter()
+
+    def twice(number: int, key: Any) -> bool:
+        failed[key] += 1
+        return failed[key] <= 2
+
+    steps, attempts, said = recordings_that_fail(device, monkeypatch, twice, 90)
     assert steps.failure is None and steps.recordings >= 1
-    assert len(attempts) == 2 and attempts[1] - attempts[0] >= 12
-    assert len(said) == 1 and "no capture; next attempt in 12 steps" in said[0] and "\n" not in said[0]
+    assert len(attempts) >= 2 and attempts[1] - attempts[0] >= 12
+    assert len(said) == 1 and "no capture; next attempt in 14 steps" in said[0] and "\n" not in said[0]
+
+
+def test_a_recording_that_fails_once_is_not_worth_a_line(device, monkeypatch):
+    steps, attempts, said = recordings_that_fail(device, monkeypatch, lambda number, key: number < 1, 40)
+    assert steps.failure is None and steps.recordings >= 1 and len(attempts) == 1 and said == []
 
 
 def test_recordings_that_keep_failing_are_given_up(device, monkeypatch):
     steps, attempts, said = recordings_that_fail(device, monkeypatch, lambda number, key: True, 90)
     assert steps.failure is not None and steps.recordings == 0
-    assert len(attempts) == recorded_step.MOST_FAILURES * len(steps._failures)
+    assert len(attempts) == (1 + len(recorded_step.RETRY_AFTER)) * len(steps._failures)
     assert len(said) == 2 and "next attempt" in said[0] and said[1].endswith("no capture")
 
 
@@ -61,7 +73,7 @@ def test_a_kind_that_cannot_be_recorded_does_not_keep_others_from_it(device, mon
     steps, _, _ = recordings_that_fail(
         device, monkeypatch, lambda number, key: size in key, 90, data=with_depth(film(6, 48)), **model
     )
-    assert sum(steps._failures.values()) > recorded_step.MOST_FAILURES
+    assert sum(steps._failures.values()) > 1 + len(recorded_step.RETRY_AFTER)
     assert steps._update is not None and len(steps._update._recorded) >= 1
 
 
