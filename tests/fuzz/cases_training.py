@@ -30,10 +30,11 @@ from scgs_warp.ops.shading import shade, tint
 from scgs_warp.ops.ssim import Form, photometric_loss
 from scgs_warp.optim import Adam
 from scgs_warp.runtime.launch import launch
+from scgs_warp.scene.arguments import ROUNDING
 from scgs_warp.scene.scene import Scene
 from scgs_warp.seeding import generator
 from scgs_warp.training.density_control import grow_and_prune
-from scgs_warp.types import Stats
+from scgs_warp.types import Camera, Stats
 
 from . import laws
 
@@ -257,7 +258,8 @@ def motion_of(name: str) -> Motion:
 
 
 def case_scene(d: Draw, device: str) -> None:
-    """A scene with arbitrary parameters renders to finite pixels at any finite time."""
+    """A scene with arbitrary parameters renders to finite pixels at any finite time, and refuses a camera that is
+    none."""
     name = d.pick(("control-points", "control-points", "static", "per-gaussian", "hexplane"))
     config = from_dict({"motion": {"model": name, "nodes": 20, "layers": 2, "width": 32, "skip": 1}})
     points, columns = bar_points(int(d.pick((1, 17, 60))), 0), config.motion.hyper_columns
@@ -275,11 +277,21 @@ def case_scene(d: Draw, device: str) -> None:
             with pytest.raises(UserError, match="time is"):
                 call(time)
         return
+    if not _is_camera(camera):
+        with pytest.raises(ValueError, match="viewmat|K"):
+            scene.render(camera, time)
+        return
     image = scene.render(camera, time)
     laws.finite("rgb, alpha, depth", image.rgb, image.alpha, image.depth)
     inside = min(max(time, 0.0), 1.0)
     laws.equal("means at the clamped time", scene.gaussians_at(time).means, scene.gaussians_at(inside).means)
     laws.finite("means of the valid", scene.gaussians_at(time).means[~hit.to(device)])
+
+
+def _is_camera(camera: Camera) -> bool:
+    finite = bool(camera.viewmat.isfinite().all() and camera.K.isfinite().all())
+    last = torch.cat([camera.viewmat[3], camera.K[2]]) - torch.tensor([0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 1.0])
+    return finite and bool(last.abs().max() <= ROUNDING and camera.K[0, 0] and camera.K[1, 1])
 
 
 CASES = {

@@ -145,7 +145,7 @@ def test_size_on_screen_may_be_of_no_account(max_screen, left):
 class Many:
     """A hundred and fifty frames, of which nothing is asked."""
 
-    frames = None
+    data = None
 
     def __len__(self) -> int:
         return 150
