@@ -278,7 +278,7 @@ def case_scene(d: Draw, device: str) -> None:
                 call(time)
         return
     if not _is_camera(camera):
-        with pytest.raises(ValueError, match="viewmat|K"):
+        with pytest.raises(ValueError, match=r"viewmat|K"):
             scene.render(camera, time)
         return
     image = scene.render(camera, time)
