@@ -20,6 +20,7 @@ from scgs_warp.apps.settings import (
     configuration,
 )
 from scgs_warp.config.presets import MotionName
+from scgs_warp.errors import UserError, shell_words
 from scgs_warp.runtime.torchrun import process_rank
 
 if TYPE_CHECKING:
@@ -91,7 +92,6 @@ def live_view(options: Options, output: Path, steps: int) -> TrainingView:
     Raises:
         UserError: the page cannot be served.
     """
-    from scgs_warp.errors import UserError
     from scgs_warp.live.training_view import TrainingView
     from scgs_warp.live.viewer import SceneView
     from scgs_warp.runtime.progress import say
@@ -148,9 +148,10 @@ def main(args: list[str] | None) -> None:
             say(group.summary())
         say(f"{output}: metrics.json, contact_sheet.png, curves.png, turntable.mp4")
         if first:
-            say(f"next: python apps/view.py --run {output} --mode time --output film.mp4")
+            name = shell_words(output)
+            say(f"next: python apps/view.py --run {name} --mode time --output film.mp4")
             if config.motion.model in ("control-points", "static"):
-                say(f"to edit: python apps/edit.py --run {output}")
+                say(f"to edit: python apps/edit.py --run {name}")
 
 
 def cli(args: list[str] | None = None) -> int:
