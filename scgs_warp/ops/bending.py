@@ -9,6 +9,7 @@ from torch import Tensor
 
 from ..kernels import bending as kernels
 from ..runtime.launch import launch
+from .shapes import check_shapes
 
 
 class NodeBend(NamedTuple):
@@ -72,9 +73,7 @@ def bend(
         "stretches": (by.stretches, (count, 3, 3)), "moved": (by.moved, (count,)),
         "weights": (weights, (total, indices.shape[-1])), "indices": (indices, (total, indices.shape[-1])),
     }  # fmt: skip
-    for name, (value, shape) in expected.items():
-        if tuple(value.shape) != shape:
-            raise ValueError(f"{name} must be {list(shape)}, got {tuple(value.shape)}")
+    check_shapes(expected)
     inputs = [value.detach().contiguous() for value in (means, quats, scales, *by)]
     found = Bent(*(torch.empty_like(value) for value in (*inputs[:3], inputs[1])))
     binding = indices.contiguous(), weights.contiguous()

@@ -13,6 +13,7 @@ from ..types import Splats, Tiles
 from . import checks, memory_windows
 from .binning_cuda import MAX_PAIRS, RadixBinning, geometry_of
 from .memory_windows import Demand, Window
+from .shapes import check_shapes
 
 CHUNK_SIZE = 1024
 """Smallest number of splats that a chunk holds on a CPU."""
@@ -149,12 +150,11 @@ def _validate(splats: Splats, tile_size: int) -> None:
             f"width, height and tile_size must be positive, got {splats.width}, {splats.height}, {tile_size}"
         )
     count = len(splats.means2d)
-    for name, shape in (
-        ("means2d", (count, 2)),
-        ("conics", (count, 3)),
-        ("opacities", (count,)),
-        ("depths", (count,)),
-        ("radii", (count, 2)),
-    ):
-        if tuple(getattr(splats, name).shape) != shape:
-            raise ValueError(f"{name} must be {list(shape)}, got {list(getattr(splats, name).shape)}")
+    expected = {
+        "means2d": (splats.means2d, (count, 2)),
+        "conics": (splats.conics, (count, 3)),
+        "opacities": (splats.opacities, (count,)),
+        "depths": (splats.depths, (count,)),
+        "radii": (splats.radii, (count, 2)),
+    }
+    check_shapes(expected)

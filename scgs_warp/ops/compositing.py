@@ -20,6 +20,7 @@ from ..types import Splats, Stats, Tiles
 from . import checks, compositing_cuda
 from .binning import bin_window
 from .memory_windows import Demand, Window, slot_bytes
+from .shapes import check_shapes
 
 Form = Literal["auto", "pixel", "cpu", "cuda", "blocks"]
 EMPTY_TILE = 8
@@ -338,22 +339,20 @@ def _validate(
     absgrad: Tensor | None,
 ) -> None:
     count = len(splats.means2d)
-    expected: list[tuple[str, Tensor | None, tuple[int, ...]]] = [
-        ("means2d", splats.means2d, (count, 2)),
-        ("conics", splats.conics, (count, 3)),
-        ("opacities", splats.opacities, (count,)),
-        ("absgrad", absgrad, (count, 2)),
-        ("tiles.offsets", None if tiles.windows or not len(tiles.offsets) else tiles.offsets, (count + 1,)),
-    ]
+    expected: dict[str, tuple[Tensor | None, tuple[int, ...]]] = {
+        "means2d": (splats.means2d, (count, 2)),
+        "conics": (splats.conics, (count, 3)),
+        "opacities": (splats.opacities, (count,)),
+        "absgrad": (absgrad, (count, 2)),
+        "tiles.offsets": (None if tiles.windows or not len(tiles.offsets) else tiles.offsets, (count + 1,)),
+    }
     if channels.ndim != 2 or len(channels) != count or channels.shape[1] < 1:
         raise ValueError(f"channels must be [{count}, C] with C >= 1, got {list(channels.shape)}")
-    expected.append(("background", background, (channels.shape[1],)))
+    expected["background"] = background, (channels.shape[1],)
     if stats is not None:
-        expected.append(("radii", splats.radii, (count, 2)))
-        expected += [(f"stats.{n}", getattr(stats, n), (count,)) for n in ("grad_norm", "count", "max_radii")]
-    for name, tensor, shape in expected:
-        if tensor is not None and tuple(tensor.shape) != shape:
-            raise ValueError(f"{name} must be {list(shape)}, got {list(tensor.shape)}")
+        expected["radii"] = splats.radii, (count, 2)
+        expected.update({f"stats.{n}": (getattr(stats, n), (count,)) for n in ("grad_norm", "count", "max_radii")})
+    check_shapes(expected)
     if (splats.width, splats.height) != (tiles.width, tiles.height):
         raise ValueError(
             f"tiles are of a {tiles.width} x {tiles.height} image, splats of {splats.width} x {splats.height}"

@@ -11,6 +11,7 @@ from ..kernels import correctives as kernels
 from ..kernels.cpu import correctives as cpu_kernels
 from ..kernels.types import LANES
 from ..runtime.launch import launch
+from .shapes import check_shapes
 
 Form = Literal["auto", "plain", "cpu"]
 
@@ -77,15 +78,13 @@ def correct(
     """
     count = means.shape[0]
     expected = {
-        "means": (means, 3),
-        "correctives": (correctives, COLUMNS),
-        "quats": (quats, 4),
-        "quats_t": (quats_t, 4),
-        "quats_own": (quats_t if quats_own is None else quats_own, 4),
+        "means": (means, (count, 3)),
+        "correctives": (correctives, (count, COLUMNS)),
+        "quats": (quats, (count, 4)),
+        "quats_t": (quats_t, (count, 4)),
+        "quats_own": (quats_own, (count, 4)),
     }
-    for name, (value, width) in expected.items():
-        if tuple(value.shape) != (count, width):
-            raise ValueError(f"{name} must be [{count}, {width}], got {tuple(value.shape)}")
+    check_shapes(expected)
     if form == "auto":
         form = "cpu" if means.device.type == "cpu" else "plain"
     turns = (None if value is None else value.detach().contiguous() for value in (quats, quats_t, quats_own))

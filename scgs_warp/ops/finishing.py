@@ -16,6 +16,7 @@ from .correctives import COLUMNS as CORRECTIVE_COLUMNS
 from .correctives import correct
 from .shading import COLUMNS as SHADING_COLUMNS
 from .shading import shade, tint
+from .shapes import check_shapes
 
 Form = Literal["auto", "plain", "cpu"]
 Finished = tuple[Tensor, Tensor, Tensor, Tensor]
@@ -144,15 +145,13 @@ def check_rest(rest: tuple[Tensor, ...], own: Tensor | None) -> None:
 def _check(means: Tensor, quats_t: Tensor, rest: tuple[Tensor, ...], log_scales, tints, own) -> None:
     count = len(rest[0])
     expected = {
-        "means": (means, 3),
-        "quats_t": (quats_t, 4),
-        "quats": (rest[1], 4),
-        "added log_scales": (log_scales, 3),
-        "tints": (tints, 3),
+        "means": (means, (count, 3)),
+        "quats_t": (quats_t, (count, 4)),
+        "quats": (rest[1], (count, 4)),
+        "added log_scales": (log_scales, (count, 3)),
+        "tints": (tints, (count, 3)),
     }
-    for name, (value, width) in expected.items():
-        if value is not None and tuple(value.shape) != (count, width):
-            raise ValueError(f"{name} must be [{count}, {width}], got {tuple(value.shape)}")
+    check_shapes(expected)
     if log_scales is not None and tints is not None:
         raise ValueError("there are log_scales or tints, not both")
     check_rest(rest, own)

@@ -12,6 +12,7 @@ from ..kernels.cpu import projection as cpu_kernels
 from ..runtime.launch import launch
 from ..types import Splats
 from .reduction import sum_rows
+from .shapes import check_shapes
 
 Form = Literal["auto", "plain", "cpu"]
 MAX_SHARPNESS = 100.0
@@ -90,9 +91,7 @@ def _validate(means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, v
         "viewmat": (viewmat, (4, 4)),
         "K": (K, (3, 3)),
     }
-    for name, (tensor, shape) in expected.items():
-        if tuple(tensor.shape) != shape:
-            raise ValueError(f"{name} must be {list(shape)}, got {tuple(tensor.shape)}")
+    check_shapes(expected)
 
 
 def project(

@@ -12,6 +12,7 @@ from ..kernels import shading as kernels
 from ..kernels.cpu import shading as cpu_kernels
 from ..kernels.types import LANES
 from ..runtime.launch import launch
+from .shapes import check_shapes
 
 Form = Literal["auto", "plain", "cpu"]
 
@@ -74,10 +75,13 @@ def shade(sh_dc: Tensor, shading: Tensor, quats: Tensor, quats_t: Tensor, *, for
         ValueError: a shape is wrong.
     """
     count = sh_dc.shape[0]
-    expected = {"sh_dc": (sh_dc, 3), "shading": (shading, COLUMNS), "quats": (quats, 4), "quats_t": (quats_t, 4)}
-    for name, (value, width) in expected.items():
-        if tuple(value.shape) != (count, width):
-            raise ValueError(f"{name} must be [{count}, {width}], got {tuple(value.shape)}")
+    expected = {
+        "sh_dc": (sh_dc, (count, 3)),
+        "shading": (shading, (count, COLUMNS)),
+        "quats": (quats, (count, 4)),
+        "quats_t": (quats_t, (count, 4)),
+    }
+    check_shapes(expected)
     quats, quats_t = quats.detach().contiguous(), quats_t.detach().contiguous()
     return _Shade.apply(sh_dc.contiguous(), shading.contiguous(), quats, quats_t, _chosen(form, sh_dc))  # type: ignore
 
@@ -115,7 +119,6 @@ def tint(sh_dc: Tensor, tints: Tensor, *, form: Form = "auto") -> Tensor:
     Raises:
         ValueError: a shape is wrong.
     """
-    for name, value in {"sh_dc": sh_dc, "tints": tints}.items():
-        if tuple(value.shape) != (sh_dc.shape[0], 3):
-            raise ValueError(f"{name} must be [{sh_dc.shape[0]}, 3], got {tuple(value.shape)}")
+    count = sh_dc.shape[0]
+    check_shapes({"sh_dc": (sh_dc, (count, 3)), "tints": (tints, (count, 3))})
     return _Tint.apply(sh_dc.contiguous(), tints.contiguous(), _chosen(form, sh_dc))  # type: ignore[return-value]

@@ -13,6 +13,7 @@ from ..runtime.launch import launch
 from ..types import Pose
 from .neighbors import NodeLists, chunk_size, node_lists, rbf_weights
 from .node_sums import skin_node_sums
+from .shapes import check_shapes
 
 
 class _Skin(torch.autograd.Function):
@@ -83,12 +84,6 @@ def pose_tensors(pose: Pose) -> tuple[Tensor | None, ...]:
     return pose.translations, pose.rotations, pose.shape_rotations, extras
 
 
-def _check_shapes(expected: dict[str, tuple[Tensor | None, tuple[int, ...]]]) -> None:
-    for name, (value, shape) in expected.items():
-        if value is not None and tuple(value.shape) != shape:
-            raise ValueError(f"{name} must be {list(shape)}, got {tuple(value.shape)}")
-
-
 def check_inputs(
     means: Tensor, quats: Tensor, nodes: Tensor, pose: Pose, indices: Tensor, weights: Tensor | None
 ) -> None:
@@ -114,7 +109,7 @@ def check_inputs(
         "pose.log_scales": (pose.log_scales, (count, 3)),
         "pose.tints": (pose.tints, (count, 3)),
     }
-    _check_shapes(expected)
+    check_shapes(expected)
     if pose.log_scales is not None and pose.tints is not None:
         raise ValueError("a pose has log_scales or tints, not both")
 
@@ -293,7 +288,7 @@ def skin_rbf(
         "hyper_points": (hyper_points, (total, width)),
         "hyper_nodes": (hyper_nodes, (count, width)),
     }
-    _check_shapes(expected)
+    check_shapes(expected)
     fits = indices.shape[1] <= skinning.MAX_NEIGHBORS and width <= skinning_palette.MAX_HYPER
     if means.device.type != "cpu" or not fits:
         points = means if hyper_points is None else torch.cat([means, hyper_points], 1)
