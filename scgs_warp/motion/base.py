@@ -9,6 +9,7 @@ from torch import Tensor, nn
 
 from ..config.presets import OptimConfig, TrainConfig
 from ..gaussians import GaussianParameters
+from ..ops.activations import exponential
 from ..optim import Adam, log_linear
 from ..types import Gaussians
 
@@ -41,6 +42,19 @@ def decay_steps(step: int, still: int, optim: OptimConfig) -> int:
 def network_rate(step: int, still: int, optim: OptimConfig) -> float:
     """Return the network's learning rate at this step of a stage that trains the network after ``still`` steps."""
     return log_linear(optim.network, optim.network_end, decay_steps(step, still, optim), optim.network_until)
+
+
+def moved_by(gaussians: GaussianParameters, means: Tensor, quats: Tensor, log_scales: Tensor) -> Gaussians:
+    """Activate Gaussians with a change of each one's mean [N, 3], quaternion [N, 4] and log scales [N, 3]."""
+    return Gaussians(
+        gaussians.means + means,
+        gaussians.quats + quats,
+        exponential(gaussians.log_scales + log_scales),
+        gaussians.opacities(),
+        gaussians.sh_dc,
+        gaussians.sh_rest,
+        gaussians.sharpness,
+    )
 
 
 class Motion(nn.Module):

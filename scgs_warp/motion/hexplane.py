@@ -10,13 +10,12 @@ from torch import Tensor, nn
 
 from ..config.presets import TrainConfig
 from ..gaussians import GaussianParameters
-from ..ops.activations import exponential
 from ..ops.network import Layers, PackedLayers, evaluate, network
 from ..ops.planes import CHANNELS, PAIRS, Smoothness, plane_features, plane_variation
 from ..optim import log_linear
 from ..seeding import generator
 from ..types import Gaussians
-from .base import Motion, MotionStep, TrainingPose, decay_steps
+from .base import Motion, MotionStep, TrainingPose, decay_steps, moved_by
 
 SPATIAL = 64
 TEMPORAL = 25
@@ -98,16 +97,7 @@ class HexPlane(Motion):
         return super().train(mode)
 
     def _moved(self, gaussians: GaussianParameters, features: Tensor) -> Gaussians:
-        means, quats, log_scales = self._decode(features).split(list(HEADS.values()), dim=1)
-        return Gaussians(
-            gaussians.means + means,
-            gaussians.quats + quats,
-            exponential(gaussians.log_scales + log_scales),
-            gaussians.opacities(),
-            gaussians.sh_dc,
-            gaussians.sh_rest,
-            gaussians.sharpness,
-        )
+        return moved_by(gaussians, *self._decode(features).split(list(HEADS.values()), dim=1))
 
     def _decode(self, features: Tensor) -> Tensor:
         """Evaluate trunk and heads as one network of three layers, returning [N, 10]: the trunk, the heads' first

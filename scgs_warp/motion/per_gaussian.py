@@ -7,10 +7,9 @@ from torch import Tensor
 
 from ..config.presets import TrainConfig
 from ..gaussians import GaussianParameters
-from ..ops.activations import exponential
 from ..runtime.device_copies import sent
 from ..types import Gaussians
-from .base import Motion, MotionStep, TrainingPose, network_rate
+from .base import Motion, MotionStep, TrainingPose, moved_by, network_rate
 from .chunks import ChunkedNetwork
 from .network import DeformationNetwork
 
@@ -29,15 +28,7 @@ class PerGaussian(Motion):
     def gaussians_at(self, gaussians: GaussianParameters, time: float | Tensor) -> Gaussians:
         times = time if isinstance(time, Tensor) else torch.tensor([time])
         out = self.network(gaussians.means.detach(), sent(times, gaussians.means.device))
-        return Gaussians(
-            gaussians.means + out["translations"][0],
-            gaussians.quats + out["rotations"][0],
-            exponential(gaussians.log_scales + out["log_scales"][0]),
-            gaussians.opacities(),
-            gaussians.sh_dc,
-            gaussians.sh_rest,
-            gaussians.sharpness,
-        )
+        return moved_by(gaussians, out["translations"][0], out["rotations"][0], out["log_scales"][0])
 
     def plan(
         self, gaussians: GaussianParameters, time: float, step: int, config: TrainConfig, view: int = 0
