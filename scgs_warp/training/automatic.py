@@ -8,7 +8,7 @@ from ..config.presets import TrainConfig
 from ..data.dataset import Dataset
 from ..geometry.normalisation import FEWEST_POINTS
 from .flow import follow_each_other
-from .second_config import may_be_tried_again
+from .second_try_config import may_be_tried_again
 from .silhouettes import is_in_parts, is_thin
 
 

@@ -1,4 +1,5 @@
-"""Random initial points for data sets without points, drawn where the images' alpha shows an object."""
+"""Initial points: those of the data with others on what moves and behind them, or random ones, where the images' alpha
+shows an object."""
 
 from __future__ import annotations
 
@@ -7,10 +8,18 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from ..config.presets import TrainConfig
 from ..data.dataset import Dataset, spread
 from ..geometry.normalisation import Normalisation
 from ..seeding import generator
 from ..types import Camera
+from .automatic import has_initial_points
+from .background_points import background_points
+from .frames import first_frames
+from .initial_models import sphere_unit, starts_in_first_pose
+from .points_on_movers import points_on_movers
+from .start_motion import SeenMotion
+from .stereo_depth import StereoDepths
 
 HALF_SIZE = 1.3
 """Half the edge of the cube in which random points are drawn, normalised units."""
@@ -22,6 +31,66 @@ SHARPNESS = 3.0
 """Exponent of the share of views in which a candidate is covered; the power is its probability of being drawn. Points
 covered in only some views must remain possible, because a moving limb covers each of its positions only part of the
 time."""
+
+
+class InitialPoints(NamedTuple):
+    """Where Gaussians and control points begin."""
+
+    points: Tensor
+    """[P, 3] normalised."""
+    colors: Tensor
+    """[P, 3]"""
+    moves: Tensor
+    """[Q] bool for the leading Q points, which lie on what is seen: True if known to move."""
+    motion: SeenMotion | None = None
+    """What is seen of the motion."""
+    stereo: StereoDepths | None = None
+    """Depth of the frames of a rig."""
+
+
+def initial_points(config: TrainConfig, data: Dataset, normalisation: Normalisation) -> InitialPoints:
+    """Choose initial points: those of the data and others about them, or random ones if the data has too few."""
+    count = max(config.init_points, round(sphere_unit(config) * config.pretrain.start_ratio))
+    if data.points is None or not has_initial_points(data, config):
+        return _at_random(count, config, data, normalisation)
+    return _of_data(count, data.points, config, data, normalisation)
+
+
+def _at_random(count: int, config: TrainConfig, data: Dataset, normalisation: Normalisation) -> InitialPoints:
+    """Draw points where the images are covered; with ``init_random`` cube, grey ones in a cube."""
+    if config.init_random == "cube":
+        points, colors = random_points(count, config.seed, 31), None
+    else:
+        # Spheres that start in the pose of the first frames are sampled from these frames only.
+        frames = first_frames(data) if starts_in_first_pose(config) and config.pretrain_steps else data
+        points, colors = sample_initial_points(count, frames, normalisation, config.seed, 31)
+    colors = torch.full_like(points, 0.5) if colors is None else colors
+    return InitialPoints(points, colors, torch.zeros(len(points), dtype=torch.bool))
+
+
+def _of_data(
+    count: int, given: Tensor, config: TrainConfig, data: Dataset, normalisation: Normalisation
+) -> InitialPoints:
+    """Take the data's points ``given`` [P, 3], world units, in random order, followed by those on what moves at one
+    instant, and by points behind them for surfaces without texture. With alpha, or with ``init_random`` cube, nothing
+    follows the data's points."""
+    order = torch.randperm(len(given), generator=generator(config.seed, 32))[:count]
+    points = normalisation.apply(given)[order].float().contiguous()
+    colors = torch.full_like(points, 0.5) if data.colors is None else data.colors[order].float()
+    moves = torch.zeros(len(points), dtype=torch.bool)
+    if config.init_random == "cube" or data.with_alpha:  # with alpha, no background lies behind the points
+        return InitialPoints(points, colors, moves)
+    known, motion, stereo = points, None, None
+    if config.flow_points and config.motion.model != "static":
+        used = min(config.init_points, config.densify.max_gaussians)
+        seen, keep, motion, stereo = points_on_movers(
+            config.flow_points, used, points, data, normalisation, config.seed
+        )
+        known, room = points[keep], used - len(seen.points)
+        points, colors = torch.cat([known[:room], seen.points]), torch.cat([colors[keep][:room], seen.colors])
+        moves = torch.cat([moves[keep][:room], seen.moves])
+    behind = background_points(count - len(points), known, data, normalisation, config.seed, 35)
+    return InitialPoints(torch.cat([points, behind[0]]), torch.cat([colors, behind[1]]), moves, motion, stereo)
 
 
 def random_points(count: int, seed: int, key: int) -> Tensor:

@@ -22,7 +22,7 @@ from ..runtime.progress import Progress, clock, progress
 from ..runtime.stop_signals import stop_signals
 from ..scene.scene import Scene
 from ..storage import checkpoint
-from .density_control import control_density, density_due, visible_gaussians
+from .density_control import Steps, control_density, density_due, take_step
 from .frames import Frames
 from .multi_view import check_replicas, check_share
 from .preflight import refuse_empty_chunks
@@ -303,25 +303,20 @@ def _take(
     frames: Frames,
     folder: RunFolder,
     bar: Progress,
-    steps: PlainSteps | RecordedSteps,
+    steps: Steps,
     looked_at: bool,
 ) -> tuple[list[StepResult], Tensor | None]:
-    """Measure visibility where pruning is due, then take a step.
+    """Take a step; save the checkpoint if that fails.
 
     Args:
-        looked_at: the step's result is needed at once; so it is wherever density is controlled.
+        looked_at: the step's result is needed at once.
 
     Returns:
         The results of all steps that have become known, and the visible Gaussians (``visible_gaussians``).
     """
-    due, results = density_due(state), []
+    results: list[StepResult] = []
     try:
-        results += steps.settle() if due else []
-        visible = visible_gaussians(state, frames)
-        results += steps.take()
-        results += steps.settle() if due or looked_at else []
-        if due:
-            steps.release()
+        visible = take_step(state, frames, steps, results, looked_at)
         return results, visible
     except NotEnoughMemory:  # nothing has changed yet: a machine with more memory can continue
         _finish(state, steps, folder, bar, results)
@@ -335,7 +330,7 @@ def _take(
 
 def _finish(
     state: TrainState,
-    steps: PlainSteps | RecordedSteps,
+    steps: Steps,
     folder: RunFolder,
     bar: Progress,
     known: Sequence[StepResult] = (),
@@ -361,9 +356,7 @@ def _process_lost(state: TrainState, folder: RunFolder, lost: ProcessLost) -> Us
     )
 
 
-def _count_failure(
-    state: TrainState, steps: PlainSteps | RecordedSteps, result: StepResult, folder: RunFolder, bar: Progress
-) -> None:
+def _count_failure(state: TrainState, steps: Steps, result: StepResult, folder: RunFolder, bar: Progress) -> None:
     """Count the dropped steps in a row, and report a dropped step.
 
     Raises:

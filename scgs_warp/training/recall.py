@@ -1,6 +1,6 @@
-"""Gaussians of which a view shows none are drawn back.
+"""Recall: Gaussians of which a view shows none are drawn back to where the cameras look.
 
-Nothing else would draw them: what is not drawn has no gradient. Large steps of the motion, at the start or after an
+Nothing else would move them: what is not drawn has no gradient. Large steps of the motion, at the start or after an
 opacity reset, can carry all of them behind the camera.
 
 On a GPU the host knows the result of a step only when it starts the second one after it, and it must wait for each step

@@ -26,9 +26,9 @@ from ..storage.checkpoint import FILE, PREVIOUS
 from ..storage.files import read_text, write_atomically
 from ..storage.json_files import parse_json
 from ..storage.locks import AlreadyLocked, lock_file
-from .pace import Pace
 from .state import StepResult, TrainState
 from .tensorboard import TensorBoard, check_installed
+from .time_estimate import TimeEstimate
 
 LOG_EVERY = 50
 """Number of steps between two log lines."""
@@ -113,7 +113,7 @@ class RunFolder:
         """Last weighted regulariser since the previous log line; steps without the term do not count, because only one
         step in a few includes ARAP."""
         self._told: set[str] = set()
-        self._pace = Pace(config)
+        self._estimate = TimeEstimate(config)
         self._torn = False
         """True if the log may end in the middle of a line."""
         self.tell: Callable[[str], None] = say
@@ -264,9 +264,9 @@ class RunFolder:
             bar.advance(1, stage=state.stage, psnr=self._psnr, gaussians=len(state.gaussians))
         else:
             bar.advance(1)
-        pace = self._pace.note(done, state.steps_again)
-        if pace is not None:
-            self.tell(pace)
+        left = self._estimate.note(done, state.steps_again)
+        if left is not None:
+            self.tell(left)
         if done % self._between == 0 and result.failed is None:
             self._show("train", result.truth, result.render, done)
         if done == state.step and time.monotonic() - self._shown_at >= PREVIEW_SECONDS:

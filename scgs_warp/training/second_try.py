@@ -1,15 +1,14 @@
-"""Second try at stage 1: frame by frame, with neighbours of the moment, and held together more firmly.
+"""Second try at stage 1: frame by frame, with neighbours of the moment, and with a stiffer ARAP.
 
-Images of single moments tell neither which of two legs passes the other nor how far a round head turns, and spheres
-move no further than the images require. The second try adds frame after frame, so that spheres begin in the pose of
-the frame before, and ties each sphere to its neighbours at that moment (``rigidity.momentary_graph``). Its spheres are
-kept if they show the training views better: bodies that truly part fit the second try worse.
+**Why.** Images of single moments tell neither which of two legs passes the other nor how far a round head turns, and
+spheres move no further than the images require. The second try adds frame after frame, so that spheres begin in the
+pose of the frame before, and ties each sphere to its neighbours at that moment (``rigidity.momentary_graph``).
 
-Training views alone do not decide. A round head that does not turn, or limbs that have exchanged their places halfway,
-show them as well as the true motion does, or better. But then the body is torn: what belongs together at one moment is
-apart at another. If the subject may be one body, a second motion that tears it far less is therefore also kept where
-both show the views alike. Where the first tears the body much, one that tears it less is kept, unless it shows the
-views clearly worse.
+**Which motion is kept.** The one that shows the training views better: bodies that truly part fit the second try worse.
+But a round head that does not turn, or limbs that have exchanged their places halfway, show the views as well as the
+true motion does, or better. They tear the body: what belongs together at one moment is apart at another. If the subject
+may be one body, the second motion is therefore kept in two more cases: if both show the views alike and it tears the
+body far less; and if the first tears the body much, the second less, and it does not show the views clearly worse.
 """
 
 from __future__ import annotations
@@ -17,7 +16,6 @@ from __future__ import annotations
 import copy
 import math
 from collections.abc import Callable
-from typing import Protocol
 
 import torch
 
@@ -26,10 +24,10 @@ from ..motion.rigidity import tearing
 from ..motion.spheres import Spheres
 from ..ops.sampling import farthest_points
 from ..runtime.environment import one_piece
-from .density_control import control_density, density_due, visible_gaussians
+from .density_control import Steps, control_density, density_due, take_step
 from .frames import Frames
 from .multi_view import check_replicas
-from .second_config import second_config
+from .second_try_config import second_config
 from .silhouettes import is_one_piece
 from .state import StepResult, TrainState
 
@@ -57,14 +55,6 @@ POINTS = 256
 """Number of spheres at which tearing is measured: among more, a smaller share of the edges crosses a tear."""
 
 
-class Steps(Protocol):
-    """Takes the steps of a state; on a GPU, results become known later (``recorded_step``)."""
-
-    def take(self) -> list[StepResult]: ...
-    def settle(self) -> list[StepResult]: ...
-    def release(self) -> None: ...
-
-
 def try_again(
     state: TrainState,
     frames: Frames,
@@ -88,24 +78,9 @@ def try_again(
     """
     second = TrainState.begin(second_config(state.config), frames.data, str(frames.device))
     second.group = state.group
-    ordered = copy.copy(frames)  # the same images in the second try's order
-    ordered.config = second.config
-    steps = steps_of(second, ordered)
-    while second.step < second.config.pretrain_steps:
-        due, last = density_due(second), second.step + 1 == second.config.pretrain_steps
-        results = steps.settle() if due else []
-        visible = visible_gaussians(second, ordered)
-        results += steps.take()
-        if due or last:
-            results += steps.settle()
-            steps.release()
-        failed = next((result.failed for result in results if result.failed is not None), None)
-        if failed is not None:
-            return f"{failed} is not finite the second time; the first motion is kept"
-        if due:
-            control_density(second, results[-1].size, visible)
-        second.step += 1
-        go_on(second)
+    failed = _train(second, frames, steps_of, go_on)
+    if failed is not None:
+        return f"{failed} is not finite the second time; the first motion is kept"
     check_replicas(second)
     before, after = shown_psnr(state, frames.data), shown_psnr(second, frames.data)
     better, reason = after > before + LEAST_GAIN, ""
@@ -122,6 +97,35 @@ def try_again(
         state.enter(second.gaussians, second.motion)
     kept = "second" if better else "first"
     return f"training views: {before:.2f} dB, the second time {after:.2f} dB; the {kept} motion is kept{reason}"
+
+
+def _train(
+    state: TrainState,
+    frames: Frames,
+    steps_of: Callable[[TrainState, Frames], Steps],
+    go_on: Callable[[TrainState], None],
+) -> str | None:
+    """Train stage 1 of a state to its end.
+
+    Returns:
+        The name of a term that was not finite, at which training stops; None if all were.
+    """
+    ordered = copy.copy(frames)  # the same images in this state's order
+    ordered.config = state.config
+    steps = steps_of(state, ordered)
+    while state.step < state.config.pretrain_steps:
+        due, last = density_due(state), state.step + 1 == state.config.pretrain_steps
+        results: list[StepResult] = []
+        visible = take_step(state, ordered, steps, results, settle=last)
+        failed = next((result.failed for result in results if result.failed is not None), None)
+        if failed is not None:
+            return failed
+        if due:
+            control_density(state, results[-1].size, visible)
+        state.step += 1
+        go_on(state)
+    steps.release()
+    return None
 
 
 @torch.no_grad()

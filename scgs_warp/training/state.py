@@ -23,32 +23,26 @@ from ..optim import Adam
 from ..scene import frame_colors
 from ..scene.scene import Scene, scene_from
 from ..scene.validation import check_metadata, check_motion, check_resumed, check_tensors, reason
-from ..seeding import generator
 from ..storage import checkpoint
 from ..types import Stats
 from .automatic import has_initial_points, resolve_auto
-from .background_points import background_points
 from .camera_refinement import CameraRefinement
 from .depth import depth_applies
 from .exposure import Exposure
-from .frames import first_frames
-from .initial_points import random_points, sample_initial_points
-from .points_on_movers import points_on_movers
-from .pretrain import (
+from .initial_models import (
     control_points_from_spheres,
     initial_gaussians,
     initial_motion,
     initial_spheres,
-    sphere_unit,
-    starts_in_first_pose,
-    thin_spheres,
 )
+from .initial_points import initial_points
 from .process_group import ProcessGroup
 from .recall import Window
 from .resuming import check_same_configuration, check_same_frames, check_steps
 from .scene_distance import place
 from .silhouettes import half_thickness
-from .start_motion import SeenMotion, learn_motion
+from .sphere_density import thin_spheres
+from .start_motion import learn_motion
 from .stereo_depth import StereoDepths, stereo_depths
 
 Stage = Literal["pretrain", "main"]
@@ -130,7 +124,7 @@ class TrainState:
         """Make the state at step 0."""
         normalisation, overview, _ = place(data)
         config = resolve_auto(config, data)
-        initial = _initial_points(config, data, normalisation)
+        initial = initial_points(config, data, normalisation)
         points, colors = initial.points.to(device), initial.colors.to(device)
         # Cameras that stand still have no extent; the extent of the content is used instead.
         extent = max(data.extent * normalisation.scale, COMMON_RADIUS)
@@ -305,53 +299,3 @@ class TrainState:
         check_motion(state.scene(), source, config.motion.chunks)
         state.motion.train()
         return state
-
-
-class InitialPoints(NamedTuple):
-    """Where Gaussians and control points begin."""
-
-    points: Tensor
-    """[P, 3] normalised."""
-    colors: Tensor
-    """[P, 3]"""
-    moves: Tensor
-    """[Q] bool for the leading Q points, which lie on what is seen: True if known to move."""
-    motion: SeenMotion | None = None
-    """What is seen of the motion."""
-    stereo: StereoDepths | None = None
-    """Depth of the frames of a rig."""
-
-
-def _initial_points(config: TrainConfig, data: Dataset, normalisation: Normalisation) -> InitialPoints:
-    """Choose initial points: the data's own in random order, followed by those on what moves at one instant, and by
-    points behind them for surfaces without texture; without points in the data, points sampled where the images are
-    covered. With ``init_random`` cube, nothing follows the data's own points, and others are random in a cube.
-    """
-    count = max(config.init_points, round(sphere_unit(config) * config.pretrain.start_ratio))
-    cube = config.init_random == "cube"
-    if data.points is None or not has_initial_points(data, config):
-        if cube:
-            points = random_points(count, config.seed, 31)
-            return InitialPoints(points, torch.full_like(points, 0.5), torch.zeros(count, dtype=torch.bool))
-        # Spheres that start in the pose of the first frames are sampled from these frames only.
-        frames = first_frames(data) if starts_in_first_pose(config) and config.pretrain_steps else data
-        points, colors = sample_initial_points(count, frames, normalisation, config.seed, 31)
-        colors = torch.full_like(points, 0.5) if colors is None else colors
-        return InitialPoints(points, colors, torch.zeros(len(points), dtype=torch.bool))
-    order = torch.randperm(len(data.points), generator=generator(config.seed, 32))[:count]
-    points = normalisation.apply(data.points)[order].float().contiguous()
-    colors = torch.full_like(points, 0.5) if data.colors is None else data.colors[order].float()
-    moves = torch.zeros(len(points), dtype=torch.bool)
-    if cube or data.with_alpha:  # with alpha, no background lies behind the points
-        return InitialPoints(points, colors, moves)
-    known, motion, stereo = points, None, None
-    if config.flow_points and config.motion.model != "static":
-        used = min(config.init_points, config.densify.max_gaussians)
-        seen, keep, motion, stereo = points_on_movers(
-            config.flow_points, used, points, data, normalisation, config.seed
-        )
-        known, room = points[keep], used - len(seen.points)
-        points, colors = torch.cat([known[:room], seen.points]), torch.cat([colors[keep][:room], seen.colors])
-        moves = torch.cat([moves[keep][:room], seen.moves])
-    behind = background_points(count - len(points), known, data, normalisation, config.seed, 35)
-    return InitialPoints(torch.cat([points, behind[0]]), torch.cat([colors, behind[1]]), moves, motion, stereo)

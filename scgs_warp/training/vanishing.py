@@ -1,4 +1,4 @@
-"""Scenes of which the views show nothing: training ends."""
+"""The end of a training whose scene shows nothing in any view."""
 
 from __future__ import annotations
 

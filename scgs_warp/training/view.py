@@ -97,8 +97,11 @@ class Compared(NamedTuple):
 
     def with_penalty(self, penalty: Tensor) -> Compared:
         """Add a penalty to the regulariser."""
-        regulariser = penalty if self.regulariser is None else self.regulariser + penalty
-        return self._replace(total=self.total + penalty, regulariser=regulariser)
+        return self._replace(total=self.total + penalty, regulariser=_plus(self.regulariser, penalty))
+
+
+def _plus(regulariser: Tensor | None, term: Tensor) -> Tensor:
+    return term if regulariser is None else regulariser + term
 
 
 def prepare(state: TrainState, frames: Frames, view: int = 0) -> View:
@@ -151,7 +154,7 @@ def compare(
     posed, regulariser = state.motion.train_at(state.gaussians, view.plan, numbers.times, numbers.weight, config)
     if view.sample is not None:
         sought = config.pretrain.silhouette * silhouette_term(posed.means, camera, view.sample)
-        regulariser = sought if regulariser is None else regulariser + sought
+        regulariser = _plus(regulariser, sought)
 
     # 2. Render.
     picture, alpha = draw(
@@ -170,18 +173,15 @@ def compare(
     # 3. Compare.
     if numbers.flow is not None and view.flow is not None:
         there = state.motion.means_at(state.gaussians, view.flow.time)
-        moved = numbers.flow.weight * flow_term(posed, there, numbers.flow)
-        regulariser = moved if regulariser is None else regulariser + moved
+        regulariser = _plus(regulariser, numbers.flow.weight * flow_term(posed, there, numbers.flow))
     if numbers.depth is not None:
-        placed = numbers.depth_weight * depth_term(posed, numbers.depth, binned)
-        regulariser = placed if regulariser is None else regulariser + placed
+        regulariser = _plus(regulariser, numbers.depth_weight * depth_term(posed, numbers.depth, binned))
     loss, l1, ssim = photometric_loss(picture, view.truth, view.mask, config.loss.ssim, form.log_weight)
     if form.pooled:
         loss = loss + pooled_residual(picture, view.truth, view.mask)
     shown = alpha.detach().amax()
     if may_recall(state) and shows_too_little(float(shown), float(l1.detach())):
-        recalled = recall(posed.means)
-        regulariser = recalled if regulariser is None else regulariser + recalled
+        regulariser = _plus(regulariser, recall(posed.means))
     total = loss if regulariser is None else loss + regulariser
     return Compared(total, loss, l1, ssim, regulariser, picture, shown)
 

@@ -27,14 +27,14 @@ from scgs_warp.data.dataset import Dataset
 from scgs_warp.errors import UserError
 from scgs_warp.runtime import environment
 from scgs_warp.runtime.torchrun import process_rank
-from scgs_warp.training import loop, process_group, second_config
+from scgs_warp.training import loop, process_group, second_try_config
 from scgs_warp.training.frames import Frames
 from scgs_warp.training.loop import fit
 from scgs_warp.training.process_group import ProcessGroup, join_processes
 from scgs_warp.training.state import StepResult, TrainState
 
 SHORT = timedelta(seconds=6)
-USUALLY = second_config.LEAST_VISITS
+USUALLY = second_try_config.LEAST_VISITS
 ENDING = ("hung", "killed")
 """Scenarios after which the processes are no longer joined."""
 
@@ -108,7 +108,7 @@ def play(name: str, group: ProcessGroup | None, output: Path) -> None:
     if name in mishaps:
         step, rank, act = mishaps[name]
         at_step(step, rank, group, act)
-    second_config.LEAST_VISITS = 1 if name == "twice" else USUALLY
+    second_try_config.LEAST_VISITS = 1 if name == "twice" else USUALLY
     process_group.PIECE = 999 if name == "rich" else 1 << 22
     loop.COMPARE_EVERY = 5 if name == "nudged" else 500
     config, data = DATA.get(name, DATA["plain"])

@@ -16,7 +16,7 @@ from scgs_warp.motion import build_motion
 from scgs_warp.motion.hexplane import BOUND, HexPlane
 from scgs_warp.ops.planes import PAIRS, Smoothness, plane_variation
 from scgs_warp.runtime import environment
-from scgs_warp.training.pretrain import initial_motion
+from scgs_warp.training.initial_models import initial_motion
 
 
 def model_and_gaussians(seed: int, count: int = 60) -> tuple[HexPlane, GaussianParameters]:

@@ -19,8 +19,8 @@ from scgs_warp.evaluation.image_metrics import psnr
 from scgs_warp.scene.scene import Scene
 from scgs_warp.storage import checkpoint
 from scgs_warp.training import loop
-from scgs_warp.training.densify import RESET_OPACITY
 from scgs_warp.training.frames import Frames
+from scgs_warp.training.gaussian_density import RESET_OPACITY
 from scgs_warp.training.loop import fit
 from scgs_warp.training.run_folder import RunFolder
 from scgs_warp.training.state import TrainState

@@ -23,7 +23,7 @@ from scgs_warp.apps.train import cli
 from scgs_warp.evaluation.evaluate import evaluate
 from scgs_warp.scene.scene import Scene
 from scgs_warp.storage.checkpoint import read
-from scgs_warp.training import loop, second_config
+from scgs_warp.training import loop, second_try_config
 from scgs_warp.training.loop import fit
 
 PATHS = {"PYTHONPATH": f"{ROOT}{os.pathsep}{ROOT / 'tests'}"}
@@ -72,7 +72,7 @@ def alone(tmp_path_factory: pytest.TempPathFactory) -> Path:
         config, data = DATA[name]
         fit(config, data(), output=folder / name)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(second_config, "LEAST_VISITS", 1)
+        patch.setattr(second_try_config, "LEAST_VISITS", 1)
         fit(TWICE, tiny_dataset(6), output=folder / "twice")
     with pytest.MonkeyPatch.context() as patch, pytest.raises(KeyboardInterrupt):
         stop_at(25, patch)

@@ -18,10 +18,10 @@ from scgs_warp.config.presets import preset
 from scgs_warp.data.dataset import Dataset
 from scgs_warp.errors import FrameError, UserError
 from scgs_warp.evaluation.image_metrics import psnr
-from scgs_warp.training import loop, second_config, second_try
+from scgs_warp.training import loop, second_try, second_try_config
 from scgs_warp.training.automatic import resolve_auto
 from scgs_warp.training.loop import fit
-from scgs_warp.training.second_config import may_be_tried_again
+from scgs_warp.training.second_try_config import may_be_tried_again
 from scgs_warp.training.state import TrainState
 
 CONFIG = tiny_config(40, pretrain={"steps": 12, "densify_until": 8, "warm_up": 2, "progressive_every": 1})
@@ -30,7 +30,7 @@ CONFIG = tiny_config(40, pretrain={"steps": 12, "densify_until": 8, "warm_up": 2
 @pytest.fixture
 def tried(monkeypatch):
     """Let stage 1 be tried again, however few steps each frame gets."""
-    monkeypatch.setattr(second_config, "LEAST_VISITS", 1)
+    monkeypatch.setattr(second_try_config, "LEAST_VISITS", 1)
 
 
 def test_where_a_second_try_may_help():
@@ -60,7 +60,7 @@ def test_the_choice_is_made_before_the_first_step(monkeypatch):
 def test_the_settings_of_the_second_try():
     first = preset("cpu")
     first = dataclasses.replace(first, pretrain=dataclasses.replace(first.pretrain, progressive_by="fifth"))
-    second = second_config.second_config(first)
+    second = second_try_config.second_config(first)
     assert (second.pretrain.progressive, second.pretrain.arap_by) == (True, "moment")
     assert second.pretrain.progressive_by == "frame"
     assert second.pretrain.arap_weight == pytest.approx(10.0 * first.pretrain.arap_weight)
@@ -95,13 +95,13 @@ def test_the_better_motion_is_kept(first_psnr, better, tried, tmp_path, device, 
         begin_main(state)
 
     monkeypatch.setattr(TrainState, "begin_main", look)
-    visible = second_try.visible_gaussians
+    take = second_try.take_step
 
-    def note(state, frames):
+    def note(state, frames, *rest, **options):
         seen.append((state.step, frames.index_at(state.step, state.config.pretrain.progressive)))
-        return visible(state, frames)
+        return take(state, frames, *rest, **options)
 
-    monkeypatch.setattr(second_try, "visible_gaussians", note)
+    monkeypatch.setattr(second_try, "take_step", note)
     fit(CONFIG, tiny_dataset(6), output=tmp_path / "run", device=device)
     assert [number for number, _ in seen] == list(range(12)), "a whole stage 1"
     assert seen[0][1] == 0, "frame by frame from the first one"
@@ -193,7 +193,9 @@ def test_the_steps_of_a_second_try_are_counted_until_it_is_made(tried):
 
 def test_the_estimate_of_the_time_counts_the_second_try(tried, tmp_path, monkeypatch):
     counted = []
-    monkeypatch.setattr("scgs_warp.training.pace.Pace.note", lambda self, step, again=0: counted.append((step, again)))
+    monkeypatch.setattr(
+        "scgs_warp.training.time_estimate.TimeEstimate.note", lambda self, step, again=0: counted.append((step, again))
+    )
     fit(CONFIG, tiny_dataset(6), output=tmp_path / "run")
     assert counted == [(step, 12 if step <= 12 else 0) for step in range(1, 41)]
 
@@ -278,13 +280,13 @@ def test_a_crash_after_the_second_try_repeats_it(tried, tmp_path, monkeypatch):
 
 def test_the_second_try_goes_frame_by_frame_whatever_the_first_did(tried, tmp_path, monkeypatch):
     by_fifths = dataclasses.replace(CONFIG, pretrain=dataclasses.replace(CONFIG.pretrain, progressive_by="fifth"))
-    ways, visible = [], second_try.visible_gaussians
+    ways, take = [], second_try.take_step
 
-    def noted(state, frames):
+    def noted(state, frames, *rest, **options):
         ways.append((state.config.pretrain.progressive_by, frames.config.pretrain.progressive_by))
-        return visible(state, frames)
+        return take(state, frames, *rest, **options)
 
-    monkeypatch.setattr(second_try, "visible_gaussians", noted)
+    monkeypatch.setattr(second_try, "take_step", noted)
     fit(by_fifths, tiny_dataset(6), output=tmp_path / "run")
     assert ways == [("frame", "frame")] * 12
 
@@ -332,9 +334,9 @@ def test_a_live_view_shows_the_second_try(tried, tmp_path):
 
 
 def test_an_image_that_is_lost_in_the_second_try(tried, tmp_path, monkeypatch):
-    def lost(state, frames):
+    def lost(*_, **__):
         raise FrameError("train/r_003.png: no such file")
 
-    monkeypatch.setattr(second_try, "visible_gaussians", lost)
+    monkeypatch.setattr(second_try, "take_step", lost)
     with pytest.raises(UserError, match=r"r_003.png: no such file; step 12 is saved: continue with --resume"):
         fit(CONFIG, tiny_dataset(6), output=tmp_path / "run")

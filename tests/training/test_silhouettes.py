@@ -17,7 +17,7 @@ from scgs_warp.ops.pooled import pooled_residual
 from scgs_warp.training import silhouettes
 from scgs_warp.training.automatic import resolve_auto
 from scgs_warp.training.frames import Frames
-from scgs_warp.training.pretrain import initial_gaussians, initial_spheres
+from scgs_warp.training.initial_models import initial_gaussians, initial_spheres
 from scgs_warp.training.silhouettes import Silhouettes, silhouette_of, silhouette_term
 from scgs_warp.training.state import TrainState
 from scgs_warp.training.step import training_step

@@ -10,7 +10,7 @@ import torch
 from helpers.tiny import tiny_config
 from scgs_warp.training import start_motion
 from scgs_warp.training.flow_points import InstantPoints
-from scgs_warp.training.pretrain import initial_motion
+from scgs_warp.training.initial_models import initial_motion
 from scgs_warp.training.start_motion import SeenMotion, _carried, _Target, learn_motion, start_cloud
 from scgs_warp.training.tracks import gather
 

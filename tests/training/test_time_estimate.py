@@ -7,17 +7,17 @@ import dataclasses
 import pytest
 
 from scgs_warp.config.presets import preset, with_steps
-from scgs_warp.training.pace import MEASURED, SKIPPED, Pace
+from scgs_warp.training.time_estimate import MEASURED, SKIPPED, TimeEstimate
 
 
 def notes(config, seconds: float, steps: int = 3_000, first: int = 0, again: int = 0) -> dict[int, str]:
     """Take steps of the same length, slow ones at the beginning."""
     now = [0.0]
-    pace = Pace(config, lambda: now[0])
+    estimate = TimeEstimate(config, lambda: now[0])
     found = {}
     for step in range(first + 1, first + steps + 1):
         now[0] += 9.0 if step <= first + SKIPPED else seconds
-        note = pace.note(step, again)
+        note = estimate.note(step, again)
         if note is not None:
             found[step] = note
     return found

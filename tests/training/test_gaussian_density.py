@@ -7,7 +7,7 @@ import torch
 from helpers.gaussian_rows import make, moments
 from scgs_warp.gaussians import GaussianParameters
 from scgs_warp.seeding import generator
-from scgs_warp.training.densify import RESET_OPACITY, SPLIT_SHRINK, clone_and_split, prune, reset_opacities
+from scgs_warp.training.gaussian_density import RESET_OPACITY, SPLIT_SHRINK, clone_and_split, prune, reset_opacities
 
 
 def test_clones_and_halves_come_last_without_momentum(device):

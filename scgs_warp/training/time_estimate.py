@@ -21,7 +21,7 @@ SLOWEST_FROM_HALF = 3.0
 """The same where the first steps use the images at half their size."""
 
 
-class Pace:
+class TimeEstimate:
     """Estimate of the time to the last step, made once, from the first steps."""
 
     def __init__(self, config: TrainConfig, now: Callable[[], float] = time.perf_counter) -> None:
