@@ -61,6 +61,7 @@ class EditSession(Posing):
         self._future: list[Edit] = []
         self._before_drag: Edit | None = None
         self._found: dict[int | None, Skeleton] = {}
+        """Skeletons by their number of parts; None: that of the run."""
 
     def __len__(self) -> int:
         """Return the number of control points."""

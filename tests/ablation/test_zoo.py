@@ -108,14 +108,14 @@ def test_other_settings_and_versions_are_compared(tmp_path):
         '{"settings": {}, "tables": [{"rows": [{"value": "rods", "psnr": 3}]}]}',
     ],
 )
-def test_a_folder_that_cannot_be_compared(tmp_path, content):
+def test_a_folder_without_a_table_of_the_zoo_cannot_be_compared(tmp_path, content):
     if content is not None:
         (tmp_path / "zoo.json").write_text(content)
     with pytest.raises(UserError, match=r"zoo\.json"):
         zoo.read_table(tmp_path)
 
 
-def test_which_subjects():
+def test_subjects_are_chosen_in_the_order_of_the_zoo():
     assert zoo.parse_subjects([]) == tuple(SUBJECTS)
     assert zoo.parse_subjects(["balls", "rods", "balls"]) == ("rods", "balls")
     with pytest.raises(UserError, match="--values 'ball': zoo takes some of robot, rods,"):
@@ -174,7 +174,7 @@ def test_mistakes_get_one_line_and_status_2(arguments, named, small, capsys):
     assert not (small / "out").exists() and not (small / "data").exists(), "nothing is begun"
 
 
-def test_a_folder_with_the_name_of_a_subject(small, capsys):
+def test_a_folder_with_the_name_of_a_subject_is_refused(small, capsys):
     blobs = write_dnerf(small / "rods", 32)
     assert app.cli(["zoo", *options(blobs, small / "out")]) == 2
     assert "there is a subject 'rods'" in capsys.readouterr().err

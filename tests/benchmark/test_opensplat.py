@@ -41,7 +41,7 @@ class Impostor:
         return torch.autograd.grad(lists[0], lists[1], v_image, retain_graph=True)
 
 
-def test_both_renderers_get_the_same_splats():
+def test_both_renderers_get_the_same_splats_and_must_draw_the_same_image():
     opensplat = benchmark_script("opensplat")
     compared = opensplat.compare(Impostor(), 150, (60, 50), 0.0)
     assert compared["pictures"]["as_it_is"]["largest"] < 1e-4 and (compared["width"], compared["height"]) == (60, 50)
@@ -55,7 +55,7 @@ def test_both_renderers_get_the_same_splats():
         opensplat.compare(Impostor(1.1), 150, (60, 50), 0.0)
 
 
-def test_a_folder_that_is_no_checkout(tmp_path, monkeypatch, capsys):
+def test_a_folder_that_is_no_checkout_is_refused(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(sys, "argv", ["opensplat.py", str(tmp_path)])
     assert benchmark_script("opensplat").main() == 2
     assert "give a checkout" in capsys.readouterr().err

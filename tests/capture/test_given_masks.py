@@ -24,7 +24,7 @@ def read(*arguments) -> list[np.ndarray]:
     return list(given_masks.read_masks(*arguments))
 
 
-def test_masks_that_are_given(tmp_path):
+def test_given_masks_belong_to_frames_by_name_order_or_number(tmp_path):
     frames = mask_images(tmp_path / "frames", 12, (320, 240))
     masks = mask_images(tmp_path / "masks", 12)
     names = [f"{index:03d}.png" for index in (2, 7)]
@@ -45,7 +45,7 @@ def test_masks_that_are_given(tmp_path):
         assert mask[11:29, 5 * index + 1 : 5 * index + 19].all() and mask.sum() < 500
 
 
-def test_masks_that_do_not_fit(tmp_path):
+def test_masks_that_do_not_fit_are_refused(tmp_path):
     frames, masks = Folder(mask_images(tmp_path / "frames", 12)), mask_images(tmp_path / "masks", 6)
     with pytest.raises(UserError, match=r"masks: no mask for 007 \(1 of 2"):
         read(masks, frames, [2, 7], ["002.png", "007.png"], (160, 120))
@@ -88,13 +88,13 @@ def rgba(color: int, alpha: np.ndarray) -> np.ndarray:
     ],
     ids=["0/1", "0/1 in colour", "0/1 of 16 bits", "0/255 of 16 bits", "16 bits", "floats", "alpha", "opaque"],
 )
-def test_masks_as_programs_write_them(tmp_path, convert, suffix):
+def test_masks_mean_the_same_however_programs_write_them(tmp_path, convert, suffix):
     expected = masks_of(tmp_path / "masks", lambda still: still.astype(np.uint8) * 255)
     assert all(mask.sum() == 400 for mask in expected)
     assert np.array_equal(masks_of(tmp_path / "others", convert, suffix), expected)
 
 
-def test_masks_with_a_palette(tmp_path):
+def test_masks_with_a_palette_are_read_by_the_order_of_its_colours(tmp_path):
     expected = masks_of(tmp_path / "masks", lambda still: still.astype(np.uint8) * 255)
     for name in NAMES:
         still = cv2.imread(str(tmp_path / "masks" / name), cv2.IMREAD_GRAYSCALE) > 128
@@ -121,12 +121,12 @@ def test_what_masks_mean_is_decided_for_all_alike(tmp_path):
         (lambda still: rgba(0, still), "differ in their alpha channel only"),
     ],
 )
-def test_masks_that_hide_everything_or_may_mean_either(tmp_path, convert, said):
+def test_masks_that_hide_everything_or_may_mean_either_are_refused(tmp_path, convert, said):
     with pytest.raises(UserError, match=f"masks: masks {'' if 'alpha' in said else '.*'}{said}"):
         masks_of(tmp_path / "masks", convert)
 
 
-def test_a_film_that_hides_everything(tmp_path):
+def test_a_film_of_masks_that_hides_everything_is_refused(tmp_path):
     with film(tmp_path / "masks.mp4") as out:
         for _ in range(4):
             out.write(np.zeros((120, 160, 3), np.uint8))

@@ -58,7 +58,7 @@ def test_locked_cameras_share_their_moments():
     assert (line.moments == line.seconds).all()
 
 
-def test_part_and_number_of_instants():
+def test_instants_lie_in_the_given_part_and_are_thinned_to_their_number():
     own = np.arange(300) / 30
     line = time_line(NAMES, [0.0, 0.0, 0.0], [own] * 3, 20, 2.0, 4.0)
     assert len(line.seconds) == 20 and line.seconds[-1] == pytest.approx(2.0, abs=0.04)
@@ -66,7 +66,7 @@ def test_part_and_number_of_instants():
     assert len(time_line(NAMES, [0.0] * 3, [own] * 3, None).seconds) == 150
 
 
-def test_cameras_of_different_rates():
+def test_cameras_of_different_rates_share_instants():
     line = time_line(NAMES[:2], [0.0, 0.01], [np.arange(60) / 30, np.arange(100) / 50], None)
     assert np.abs(line.moments[1] - line.seconds).max() <= 0.5 / 50 + 1e-9
 
@@ -79,7 +79,7 @@ def test_no_time_in_common_is_said():
         time_line(NAMES[:2], [0.0, 0.9], [own, own], None)
 
 
-def test_moments_of_a_film(tmp_path):
+def test_moments_are_those_of_the_frames_of_a_film(tmp_path):
     write_film(tmp_path / "film.mp4", [np.full((64, 64, 3), k * 8, np.uint8) for k in range(20)], 12.5, 20, None)
     np.testing.assert_allclose(frame_seconds(tmp_path / "film.mp4"), np.arange(20) / 12.5, atol=1e-6)
     (tmp_path / "text.mp4").write_text("no film")
