@@ -17,7 +17,7 @@ from ..ops.neighbors import NeighborSearch, rbf_weights
 from ..ops.posing import pose_gaussians, unit_pose
 from ..ops.skinning import skin, skin_rbf
 from ..runtime.device_copies import sent
-from ..seeding import generator
+from ..seeding import Purpose, generator
 from ..types import Gaussians, Pose
 from .base import Motion, MotionStep, TrainingPose, network_rate
 from .chunks import ChunkedNetwork
@@ -66,7 +66,7 @@ def make_network(config: MotionConfig, heads: dict[str, int], seed: int) -> Defo
             time_frequencies=config.time_frequencies,
             bfloat16=config.bfloat16,
             bfloat16_adjoint=config.bfloat16_adjoint,
-            generator=generator(seed, 11, chunk) if chunk else generator(seed, 11),
+            generator=generator(seed, Purpose.NETWORK, chunk) if chunk else generator(seed, Purpose.NETWORK),
         )
 
     return make(0) if config.chunks == 1 else ChunkedNetwork(make, config.chunks)
@@ -291,7 +291,7 @@ class ControlPoints(Motion):
         if weight == 0.0:
             return MotionStep((time,))
         self.refresh_graph(step, config.loss)
-        others = arap_times(config.loss, generator(config.seed, 21, step * config.batch + view))
+        others = arap_times(config.loss, generator(config.seed, Purpose.ARAP_TIMES, step * config.batch + view))
         return MotionStep((time, *others), 0.0 if self.graph is None else weight)
 
     def refresh_due(self, step: int, config: TrainConfig) -> bool:

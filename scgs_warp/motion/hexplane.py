@@ -13,7 +13,7 @@ from ..gaussians import GaussianParameters
 from ..ops.network import Layers, PackedLayers, evaluate, network
 from ..ops.planes import CHANNELS, PAIRS, Smoothness, plane_features, plane_variation
 from ..optim import log_linear
-from ..seeding import generator
+from ..seeding import Purpose, generator
 from ..types import Gaussians
 from .base import Motion, MotionStep, TrainingPose, decay_steps, moved_by
 
@@ -39,7 +39,7 @@ class HexPlane(Motion):
 
     def __init__(self, seed: int = 0, times: int = TEMPORAL) -> None:
         super().__init__()
-        random = generator(seed, 12)
+        random = generator(seed, Purpose.PLANES)
         self.planes = nn.ParameterList()
         for multiple in MULTIPLES:
             for _, second in PAIRS:

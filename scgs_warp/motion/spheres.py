@@ -11,7 +11,7 @@ from ..config.presets import TrainConfig
 from ..gaussians import GaussianParameters
 from ..runtime.device_copies import sent
 from ..runtime.environment import one_piece
-from ..seeding import generator
+from ..seeding import Purpose, generator
 from ..types import Gaussians
 from .base import Motion, MotionStep, TrainingPose, network_rate
 from .chunks import ChunkedNetwork
@@ -79,7 +79,9 @@ class Spheres(Motion):
             return MotionStep((time,), phase="rest")
         if not self._compares(step, config):
             return MotionStep((time,))
-        others = arap_times(config.loss, generator(config.seed, 22, step * config.batch + view))
+        others = arap_times(
+            config.loss, generator(config.seed, Purpose.ARAP_TIMES_OF_SPHERES, step * config.batch + view)
+        )
 
         def positions_at(times: Tensor) -> Tensor:
             return gaussians.means + self.translations(gaussians.means, times)

@@ -28,7 +28,7 @@ from ..motion.control_points import ControlPoints
 from ..motion.node_density import adapt_control_points
 from ..motion.spheres import Spheres
 from ..runtime import memory
-from ..seeding import generator
+from ..seeding import Purpose, generator
 from ..types import plain_scale
 from .frames import Frames
 from .gaussian_density import grow_and_prune, mean_gradient, prune, reset_opacities
@@ -152,7 +152,7 @@ def visible_gaussians(state: TrainState, frames: Frames) -> Tensor | None:
     count = min(len(frames), MOST_VIEWS, steps // STEPS_PER_VIEW)
     if count < min(len(frames), FEWEST_VIEWS):
         return None
-    order = torch.randperm(len(frames), generator=generator(state.config.seed, 52, state.step))
+    order = torch.randperm(len(frames), generator=generator(state.config.seed, Purpose.VISIBILITY_VIEWS, state.step))
     seen = seen_by(state, frames, order[:count].tolist(), config.min_contribution)
     keep = seen.most >= config.min_contribution
     if config.least_views > 1 and count == len(frames) >= config.least_views:
@@ -281,7 +281,7 @@ def _control_gaussians(state: TrainState, size: tuple[int, int], visible: Tensor
             grad_threshold=threshold,
             extent=state.extent,
             prune_large=done > config.opacity_reset_every and config.prune_large != "never",
-            random=generator(state.config.seed, 51, state.step),
+            random=generator(state.config.seed, Purpose.SPLIT_GAUSSIANS, state.step),
         )
         state.reset_stats()
 

@@ -28,24 +28,24 @@ from .flow_points import LEAST_REGION, InstantPoints, colors_at, strays
 MOST_MOMENTS = 24
 """Largest number of moments at which points are sought."""
 FOLLOWED = (2, 4, 8, 16)
-"""Numbers of frames after which a point at rest must be where flow leads."""
+"""Numbers of frames over which flow is followed: afterwards, a point at rest must be where flow leads."""
 LEFT, OF_PARALLAX = 0.006, 0.15
-"""Distance from which it is not: a share of the image's longer side, and a share of its parallax against what is far
-away, since depth is not exact."""
+"""Distance from where flow leads beyond which a point has moved: a share of the image's longer side, plus a share of
+the point's parallax against what is far away, since depth is not exact."""
 TWICE = 0.2
-"""Least share of a region that is not there in two frames, since flow errs."""
+"""Least share of a moving region's pixels that have moved in two frames: in a single one, flow may err."""
 AROUND, SAME_DEPTH = 0.055, 0.04
 """Distance, as a share of the longer side of the image, and difference of the logarithm of depth, within which pixels
-decide together."""
+decide together whether they move."""
 BLEEDS, NEARER = 0.05, 0.85
-"""Distance from an outline, as a share of the longer side, at which flow is still that of the nearer side; and the
-depth of what is nearer, as a share of a pixel's own, at most."""
+"""Distance from an outline, as a share of the longer side of the image, within which a pixel behind the outline may
+have the flow of what is before it; and the largest depth of what is before it, as a share of the pixel's own."""
 UNSURE = 0.3
-"""Weight of the pixels there; others count as 1."""
+"""Weight of the pixels within ``BLEEDS`` of an outline when pixels decide; others count as 1."""
 MAJORITY = 0.5
-"""Least share of these that move."""
+"""Least weighted share of the pixels that decide together that must move."""
 FEWEST, ENOUGH = 50, 0.4
-"""Least number of a moment's points, and as a share of the largest."""
+"""Least number of a moment's points: as a number, and as a share of the largest number of any moment."""
 GHOST = 3.0
 """Distance to a moving point, in distances between neighbouring ones, up to which a sparse point lies on what moves."""
 
@@ -138,23 +138,16 @@ def later_places(one: FramePoints, following: int, flows: Flows, depths: FrameDe
 def _moves(index: int, points: np.ndarray, pixels: np.ndarray, flows: Flows) -> tuple[np.ndarray, np.ndarray]:
     """Follow the points [P, 3], seen at pixels [P, 2] of a frame: the number [P] of frames in which they are not where
     flow leads, and [P] bool where flow is certain in any."""
-    columns, rows = pixels.astype(int).T
     far = ray_of(flows.camera(index), pixels)[1]
     left, certain = np.zeros(len(points), int), np.zeros(len(points), bool)
-    for side in (0, 1):
-        for span in FOLLOWED:
-            path = flows.path(index, span, side)
-            if len(path) <= span:
-                break
-            vectors, sure = flows.along(path)
-            other, targets = flows.camera(path[-1]), targets_of(vectors)[rows, columns]
-            at, depth = pixels_of(other, points)
-            distant = pixels_of(other, other.position.double().numpy() + far)[0]
-            here = sure[rows, columns] & (depth > 0)
-            with np.errstate(invalid="ignore"):
-                tolerance = LEFT * max(other.width, other.height) + OF_PARALLAX * np.linalg.norm(at - distant, axis=1)
-                left += here & (np.linalg.norm(at - targets, axis=1) > tolerance)
-            certain |= here
+    for other, targets, sure in flows.followed(index, pixels, FOLLOWED):
+        at, depth = pixels_of(other, points)
+        distant = pixels_of(other, other.position.double().numpy() + far)[0]
+        here = sure & (depth > 0)
+        with np.errstate(invalid="ignore"):
+            tolerance = LEFT * max(other.width, other.height) + OF_PARALLAX * np.linalg.norm(at - distant, axis=1)
+            left += here & (np.linalg.norm(at - targets, axis=1) > tolerance)
+        certain |= here
     return left, certain
 
 

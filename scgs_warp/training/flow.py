@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import cv2
@@ -141,6 +141,21 @@ class Flows:
             vectors = vectors + at_targets(more.astype(np.float32), targets)
             certain = certain & (at_targets(sure.astype(np.float32), targets) > 0.99)
         return vectors, certain
+
+    def followed(
+        self, index: int, pixels: np.ndarray, spans: Sequence[int]
+    ) -> Iterator[tuple[Camera, np.ndarray, np.ndarray]]:
+        """Follow pixels [P, 2] of a frame to the frames that are ``spans`` before and after it, as far as the film
+        goes: yield each one's camera, the places [P, 2] in it, and [P] bool where they are certain."""
+        columns, rows = pixels.astype(int).T
+        for side in (0, 1):
+            for span in spans:
+                path = self.path(index, span, side)
+                if len(path) <= span:
+                    break
+                vectors, certain = self.along(path)
+                targets = targets_of(vectors)[rows, columns].astype(np.float64)
+                yield self.camera(path[-1]), targets, certain[rows, columns]
 
     def _pair(self, one: int, two: int) -> tuple[np.ndarray, np.ndarray]:
         kept = self._kept.get((one, two))

@@ -27,7 +27,7 @@ CANDIDATES = 12
 WIDEST = 0.12
 """Distance from camera to camera, as a share of the distance to the content, up to which flow is followed."""
 LEAST_BASELINE = 0.02
-"""The least such distance that gives depth."""
+"""Distance from camera to camera, as a share of the distance to the content, from which flow gives depth."""
 LONGEST_SPAN = 12
 """Largest number of frames over which flow is followed in each direction."""
 ENOUGH = 0.5
@@ -36,11 +36,11 @@ APART = 0.3
 """Largest distance of a pixel from its place as seen from the found point, as a share of the parallax of its
 surroundings against what is far away."""
 FOLLOWED = (4, 8, 16, 24)
-"""Numbers of frames after which a point at rest must be where flow leads."""
+"""Numbers of frames over which flow is followed: afterwards, a point at rest must be where flow leads."""
 LEFT = 0.008
-"""Distance, as a share of the image's longer side, from which it is not."""
+"""Distance from where flow leads, as a share of the image's longer side, beyond which a point has moved."""
 AROUND_PIXEL, MAJORITY = 9, 0.6
-"""Side of the square around a pixel, and the least share of its pixels that must move."""
+"""Side of the square around a pixel, and the least share of its pixels that must move if the pixel does."""
 LEAST_REGION = 0.002
 """Least share of the image that moves together."""
 CLOSE, STRAY = 8, 3.0
@@ -120,17 +120,10 @@ def _spread(moves: Tensor, count: int) -> Tensor:
 def _moves(index: int, pixels: np.ndarray, flows: Flows) -> np.ndarray:
     """Tell which of the pixels [P, 2] of a frame show what moves, [P] bool: no place at rest is where flow to frames
     further away leads."""
-    columns, rows = pixels.astype(int).T
     camera = flows.camera(index)
     seen = [(camera, pixels, np.ones(len(pixels)))]
-    for side in (0, 1):
-        for span in FOLLOWED:
-            path = flows.path(index, span, side)
-            if len(path) <= span:
-                break
-            vectors, certain = flows.along(path)
-            targets = targets_of(vectors)[rows, columns].astype(np.float64)
-            seen.append((flows.camera(path[-1]), targets, certain[rows, columns].astype(np.float64)))
+    for other, targets, certain in flows.followed(index, pixels, FOLLOWED):
+        seen.append((other, targets, certain.astype(np.float64)))
     weights = [weight for _, _, weight in seen]
     places = _meeting([ray_of(view, at) for view, at, _ in seen], weights)
     moves = np.zeros(len(pixels), bool)

@@ -15,7 +15,7 @@ from ..data.dataset import Dataset
 from ..errors import FrameError, UserError
 from ..geometry.normalisation import Normalisation
 from ..runtime.device_copies import sent
-from ..seeding import generator
+from ..seeding import Purpose, generator
 from ..types import Camera, Frame
 from .depth import Depths, FrameDepths
 from .device_images import DeviceImages
@@ -131,7 +131,7 @@ class Frames:
         count = allowed - first
         epoch, position = divmod(number, count)
         if self._order[0] != (epoch, count):
-            order = torch.randperm(count, generator=generator(self.config.seed, 41, epoch, count))
+            order = torch.randperm(count, generator=generator(self.config.seed, Purpose.FRAME_ORDER, epoch, count))
             self._order = ((epoch, count), order.tolist())
         return self.by_time[first + self._order[1][position]]
 
@@ -187,7 +187,7 @@ class Frames:
         has_alpha, has_mask = self._parts[key]
         background = self.background
         if has_alpha and (random_background or self.random_background):
-            random = generator(self.config.seed, 42, view_number(step, self.config, view))
+            random = generator(self.config.seed, Purpose.BACKGROUND, view_number(step, self.config, view))
             color = torch.rand(3, generator=random)
             uncovered = 1.0 - self.images.plane(("alpha", *key), lambda: present(pixels().alpha))
             truth = truth + uncovered * sent(color - background, self.device)[:, None, None]

@@ -14,7 +14,7 @@ from ..motion import HexPlane, Motion, build_motion
 from ..motion.control_points import ControlPoints, heads_of, make_network
 from ..motion.spheres import Spheres
 from ..ops.sampling import farthest_points
-from ..seeding import generator
+from ..seeding import Purpose, generator
 
 START_RADIUS = 0.5
 """Radius of the spheres at the start of progressive pre-training, as a share of their spacing."""
@@ -123,7 +123,7 @@ def _unstretched(
     with torch.no_grad():
         opaque = torch.where(parents.opacities() >= config.pretrain.solid_opacity)[0]
         opaque = opaque if len(opaque) else torch.arange(len(parents), device=opaque.device)
-        random = generator(config.seed, 34)
+        random = generator(config.seed, Purpose.GAUSSIANS_OF_SPHERES)
         chosen = opaque[torch.randint(len(opaque), (count,), generator=random).to(opaque.device)]
         offsets = torch.randn(count, 3, generator=random).to(chosen.device) * motion.log_radius.exp()
         colors = (parents.sh_dc[chosen] * SH_C0 + 0.5).clamp(0.0, 1.0)

@@ -11,7 +11,7 @@ from torch import Tensor
 from ..config.presets import TrainConfig
 from ..data.dataset import Dataset, spread
 from ..geometry.normalisation import Normalisation
-from ..seeding import generator
+from ..seeding import Purpose, generator
 from ..types import Camera
 from .automatic import has_initial_points
 from .background_points import background_points
@@ -59,11 +59,11 @@ def initial_points(config: TrainConfig, data: Dataset, normalisation: Normalisat
 def _at_random(count: int, config: TrainConfig, data: Dataset, normalisation: Normalisation) -> InitialPoints:
     """Draw points where the images are covered; with ``init_random`` cube, grey ones in a cube."""
     if config.init_random == "cube":
-        points, colors = random_points(count, config.seed, 31), None
+        points, colors = random_points(count, config.seed, Purpose.RANDOM_POINTS), None
     else:
         # Spheres that start in the pose of the first frames are sampled from these frames only.
         frames = first_frames(data) if starts_in_first_pose(config) and config.pretrain_steps else data
-        points, colors = sample_initial_points(count, frames, normalisation, config.seed, 31)
+        points, colors = sample_initial_points(count, frames, normalisation, config.seed, Purpose.RANDOM_POINTS)
     colors = torch.full_like(points, 0.5) if colors is None else colors
     return InitialPoints(points, colors, torch.zeros(len(points), dtype=torch.bool))
 
@@ -74,7 +74,7 @@ def _of_data(
     """Take the data's points ``given`` [P, 3], world units, in random order, followed by those on what moves at one
     instant, and by points behind them for surfaces without texture. With alpha, or with ``init_random`` cube, nothing
     follows the data's points."""
-    order = torch.randperm(len(given), generator=generator(config.seed, 32))[:count]
+    order = torch.randperm(len(given), generator=generator(config.seed, Purpose.DATA_POINTS))[:count]
     points = normalisation.apply(given)[order].float().contiguous()
     colors = torch.full_like(points, 0.5) if data.colors is None else data.colors[order].float()
     moves = torch.zeros(len(points), dtype=torch.bool)
@@ -89,7 +89,7 @@ def _of_data(
         known, room = points[keep], used - len(seen.points)
         points, colors = torch.cat([known[:room], seen.points]), torch.cat([colors[keep][:room], seen.colors])
         moves = torch.cat([moves[keep][:room], seen.moves])
-    behind = background_points(count - len(points), known, data, normalisation, config.seed, 35)
+    behind = background_points(count - len(points), known, data, normalisation, config.seed, Purpose.BACKGROUND_POINTS)
     return InitialPoints(torch.cat([points, behind[0]]), torch.cat([colors, behind[1]]), moves, motion, stereo)
 
 

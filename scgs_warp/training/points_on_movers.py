@@ -9,6 +9,7 @@ from torch import Tensor
 
 from ..data.dataset import Dataset
 from ..geometry.normalisation import FEWEST_POINTS, Normalisation
+from ..seeding import Purpose
 from ..types import Camera
 from .depth import Depths
 from .depth_points import depth_clouds, on_movers
@@ -18,9 +19,6 @@ from .start_motion import SeenMotion, start_cloud
 from .stereo_depth import StereoDepths, stereo_depths
 from .stereo_points import moving_points, stereo_clouds
 from .tracks import gather
-
-KEY = 36
-"""Of the random choice."""
 
 SHARE = 0.5
 """Largest share of all initial points that stereo gives, and least share of the sparse points that must stay."""
@@ -56,7 +54,7 @@ def points_on_movers(
     stereo = stereo_depths(data, normalisation)
     if stereo is not None:
         most = min(most, int(SHARE * count))
-        clouds = stereo_clouds(stereo, Flows(data, views), most, seed, KEY)
+        clouds = stereo_clouds(stereo, Flows(data, views), most, seed, Purpose.MOVING_POINTS)
         found, motion = _gathered(clouds, most, seed)
         if found is not None:
             keep = _kept(known, torch.from_numpy(~moving_points(known.double().numpy(), stereo.standing)))
@@ -82,7 +80,7 @@ def _by_depth(
     """Find up to ``most`` points, and what depth maps show of their motion; None if nothing moves."""
     depths = Depths(data, views, scale)
     depths.read()
-    clouds = depth_clouds(most, data, views, depths, seed, KEY)
+    clouds = depth_clouds(most, data, views, depths, seed, Purpose.MOVING_POINTS)
     return _gathered(clouds, most, seed)
 
 
@@ -91,5 +89,5 @@ def _gathered(clouds: list[InstantPoints], most: int, seed: int) -> tuple[Instan
     if not clouds:
         return None, None
     start = [cloud.time for cloud in clouds].index(start_cloud(clouds).time)
-    found, tracks = gather(clouds, start, most, seed, KEY)
+    found, tracks = gather(clouds, start, most, seed, Purpose.MOVING_POINTS)
     return found, None if found is None else SeenMotion(found, clouds, tracks)

@@ -16,7 +16,7 @@ from ..gaussians import GaussianParameters
 from ..motion.spheres import Spheres
 from ..ops.sampling import farthest_points
 from ..optim import Adam
-from ..seeding import generator
+from ..seeding import Purpose, generator
 from ..types import Stats
 from .gaussian_density import SPLIT_SHRINK, grow_and_prune, mean_gradient
 from .initial_models import sphere_unit
@@ -56,7 +56,9 @@ def densify_spheres(
         wanted = min(round(config.pretrain.clone_share * len(kept)), max(limit - len(kept), 0))
         wanted = max(wanted, config.motion.nodes - len(kept))
         parents = kept[gradient.argsort(descending=True, stable=True)]
-        clone_spheres(gaussians, optimizer, spheres, kept, parents, wanted, generator(config.seed, 32, step))
+        clone_spheres(
+            gaussians, optimizer, spheres, kept, parents, wanted, generator(config.seed, Purpose.CLONED_SPHERES, step)
+        )
 
 
 def densify_spheres_by_gradient(
@@ -87,7 +89,7 @@ def densify_spheres_by_gradient(
         grad_threshold=config.pretrain.grad_threshold,
         extent=extent,
         prune_large=False,
-        random=generator(config.seed, 33, step),
+        random=generator(config.seed, Purpose.SPLIT_SPHERES, step),
     )
     with torch.no_grad():
         halves = int((gaussians.log_scales[:, :1] < spheres.log_radius).sum())
@@ -95,7 +97,9 @@ def densify_spheres_by_gradient(
         kept = torch.arange(len(gaussians), device=gaussians.means.device)
         parents = gaussians.opacities().argsort(descending=True, stable=True)
         missing = max(config.motion.nodes - len(kept), 0)
-        clone_spheres(gaussians, optimizer, spheres, kept, parents, missing, generator(config.seed, 32, step))
+        clone_spheres(
+            gaussians, optimizer, spheres, kept, parents, missing, generator(config.seed, Purpose.CLONED_SPHERES, step)
+        )
 
 
 def clone_spheres(

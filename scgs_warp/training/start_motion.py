@@ -20,7 +20,7 @@ from ..motion import ControlPoints
 from ..optim import Adam, log_linear
 from ..runtime.progress import progress
 from ..runtime.search_tree import search_tree
-from ..seeding import generator
+from ..seeding import Purpose, generator
 from .flow_points import InstantPoints
 from .tracks import Tracks
 
@@ -75,13 +75,13 @@ def learn_motion(motion: ControlPoints, seen: SeenMotion, resting: Tensor, confi
     tracks = None if seen.tracks is None else seen.tracks.of(source.chosen).to(device)
     for target in targets:
         target.prepare(COLOR * size)
-    chosen = torch.randperm(len(resting), generator=generator(config.seed, 51))[:RESTING]
+    chosen = torch.randperm(len(resting), generator=generator(config.seed, Purpose.RESTING_POINTS))[:RESTING]
     gaussians = _carried(source, resting[chosen].float(), config).to(device)
     count = len(source.points)
     body = _Body(source.points)
     network = dict(motion.network.named_parameters())
     optimizer = Adam(network, dict.fromkeys(network, RATE))
-    draws = generator(config.seed, 52)
+    draws = generator(config.seed, Purpose.CLOUDS)
     steps = STEPS if tracks is None else max(STEPS_TRACKED, STEPS_PER_CLOUD * len(clouds))
     with progress(steps, "motion of what moves") as bar:
         for step in range(steps):
@@ -134,7 +134,7 @@ class _Target:
     """The points of one cloud, to which others are drawn."""
 
     def __init__(self, seen: InstantPoints, seed: int, number: int) -> None:
-        self.chosen = torch.randperm(len(seen.points), generator=generator(seed, 53, number))[:POINTS]
+        self.chosen = torch.randperm(len(seen.points), generator=generator(seed, Purpose.CLOUD_POINTS, number))[:POINTS]
         self.points, self.colors = seen.points[self.chosen], seen.colors[self.chosen]
         self.size = float((self.points - self.points.median(0).values).norm(dim=1).median())
 

@@ -22,7 +22,7 @@ from .standing_cameras import StandingCamera
 from .stereo_depth import StereoDepths
 
 FEWEST, ENOUGH = 50, 0.4
-"""Least number of a moment's points, and as a share of the largest."""
+"""Least number of a moment's points: as a number, and as a share of the largest number of any moment."""
 MOST_FOLLOWED = 1500
 """About the largest number of frames between which flow is measured: of a large rig, only some cameras are followed, at
 least two."""

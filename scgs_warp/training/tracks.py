@@ -23,14 +23,12 @@ FEWEST = 32
 """Least number of tracked points between two clouds."""
 OUTLIERS = 3.0
 """Factor on the median difference from the common motion of the points around, beyond which a track is dropped."""
-
-
 NEAR = 0.1
 """Distance to the tracked points around, in sizes of the mover, at which a step of a track is half as sure."""
 LEAST_SURE = 0.15
 """Least weight in the pose of the first cloud with which a point of another is taken there."""
 STILL = 1.0
-"""Distance, in units of ``NEAR``, that a point must go at least: others are taken for what moves by mistake."""
+"""Least distance, in units of ``NEAR``, that a point must go. Those that go less do not move after all."""
 FRESH = 2.0
 """Least distance to the points taken before, in distances between neighbouring points of the first cloud."""
 

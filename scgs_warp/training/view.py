@@ -17,7 +17,7 @@ from ..motion.base import MotionStep
 from ..ops.pooled import pooled_residual
 from ..ops.ssim import photometric_loss
 from ..rendering.render import draw
-from ..seeding import generator
+from ..seeding import Purpose, generator
 from ..types import Camera, Splats, Stats, Tiles
 from .depth import SeenDepth, depth_term, depth_weight
 from .exposure import exposed
@@ -122,14 +122,15 @@ def prepare(state: TrainState, frames: Frames, view: int = 0) -> View:
     frames.expect(step + later, progressive, next_view)
     time = noisy_time(frames.data.entries[index].time, state, len(frames), view)
     plan = state.motion.plan(state.gaussians, time, step, config, view)
-    random = generator(config.seed, 45, view_number(state.step, config, view))
+    number = view_number(state.step, config, view)
+    random = generator(config.seed, Purpose.SILHOUETTE_PIXELS, number)
     sample = None if loaded.silhouette is None else loaded.silhouette.sample(random)
     pooled = config.pretrain.pooled if pretraining else config.loss.pooled == "always"
     collects = pretraining or step < config.densify.until
     form = Form(sh_degree(state, step), collects, log_weight(state), pooled)
     flow = None
     if state.stage == "main" and flow_weight(step, config) > 0.0:
-        flow = frames.flows.between(index, generator(config.seed, 46, view_number(state.step, config, view)))
+        flow = frames.flows.between(index, generator(config.seed, Purpose.FLOW_FRAME, number))
     weight = depth_weight(step, config) if state.stage == "main" else 0.0
     depth = frames.depths.of(index) if weight > 0.0 else None
     images = loaded.truth, loaded.mask, sample, flow, depth
@@ -234,5 +235,5 @@ def noisy_time(time: float, state: TrainState, frames: int, view: int = 0) -> fl
     spread = config.motion.time_noise * fade / max(frames - 1, 1)
     if spread == 0.0:
         return time
-    noise = torch.randn(1, generator=generator(config.seed, 43, view_number(state.step, config, view)))
+    noise = torch.randn(1, generator=generator(config.seed, Purpose.TIME_NOISE, view_number(state.step, config, view)))
     return min(max(time + spread * float(noise), 0.0), 1.0)
