@@ -112,7 +112,7 @@ def _until(process: subprocess.Popen[bytes], folder: Path, call: Call, deadline:
 
 
 def figures(folder: Path, call: Call) -> Report:
-    """Read from the run directory how far the run is."""
+    """Read from the run folder how far the run is."""
     of = read_json(folder / "config.json")["steps"] if (folder / "config.json").is_file() else 0
     log = read_log(folder / "log.jsonl") if (folder / "log.jsonl").is_file() else []
     steps, seconds = (log[-1]["step"], log[-1]["seconds"]) if log else (0, 0.0)

@@ -1,6 +1,6 @@
 """The presets, and functions to read and write configurations.
 
-``with_steps`` scales the milestones when ``--steps`` changes the total. ``config.json`` of a run directory holds
+``with_steps`` scales the milestones when ``--steps`` changes the total. ``config.json`` of a run folder holds
 ``to_dict`` of the configuration and can be read back.
 """
 

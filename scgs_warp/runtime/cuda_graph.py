@@ -161,7 +161,7 @@ class CudaGraph:
         return self.result
 
 
-class Steps:
+class PlainGraph:
     """Stand-in for a ``CudaGraph`` on a CPU: it runs ``body`` at every replay."""
 
     overwrites = False

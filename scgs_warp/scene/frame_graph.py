@@ -23,7 +23,7 @@ from ..ops.compositing import image_demand
 from ..ops.memory_windows import require_image
 from ..rendering.render import draw, expected_depth
 from ..runtime import debug, memory
-from ..runtime.cuda_graph import CudaGraph, Steps
+from ..runtime.cuda_graph import CudaGraph, PlainGraph
 from ..runtime.device_copies import pinned, sent
 from ..types import Camera, Image, Splats, Tiles
 
@@ -85,7 +85,7 @@ class FrameGraph:
         self._size = (0, 0)
         self._state: list[Any] = []
         self._frames_of_state = 0
-        self._recorded: CudaGraph | Steps | None = None
+        self._recorded: CudaGraph | PlainGraph | None = None
         self._kept: list[Any] = []
         self._lock = threading.Lock()
 
@@ -128,7 +128,7 @@ class FrameGraph:
             device = self.inputs.device
             self.inputs.copy_(pinned(inputs, device), non_blocking=True)
             self._follow(size)
-            recorded = self._recorded or Steps(self.draw_steps)
+            recorded = self._recorded or PlainGraph(self.draw_steps)
             image, total = recorded.replay()
             if recorded.overwrites:
                 planes = image.rgb.permute(2, 0, 1).clone()
@@ -159,7 +159,7 @@ class FrameGraph:
 
     def _record(self) -> None:
         if self.inputs.device.type != "cuda":
-            self._recorded = Steps(self.draw_steps)
+            self._recorded = PlainGraph(self.draw_steps)
         else:
             try:
                 self._recorded = CudaGraph(self.draw_steps, self.inputs.device)

@@ -47,11 +47,11 @@ def clamped_time(time: float) -> float:
 
 
 class Scene:
-    """A trained scene, as returned by training and stored in a run directory. Public methods use world units.
+    """A trained scene, as returned by training and stored in a run folder. Public methods use world units.
 
     Attributes: ``gaussians`` (:class:`GaussianParameters`, normalised units), ``motion``, ``normalisation``,
     ``config``, ``overview`` (summary of the training cameras), ``step``, ``settings`` (``config.json`` as a dict),
-    ``folder`` (the run directory; None for a scene from elsewhere).
+    ``folder`` (the run folder; None for a scene from elsewhere).
     """
 
     def __init__(
@@ -73,7 +73,7 @@ class Scene:
 
     @staticmethod
     def load(run: str | Path, device: str = "cpu") -> Scene:
-        """Load the scene of a run directory written by :func:`scgs_warp.fit` or ``apps/train.py``.
+        """Load the scene of a run folder written by :func:`scgs_warp.fit` or ``apps/train.py``.
 
         Args:
             run: the folder, which holds ``checkpoint.safetensors``.
@@ -91,7 +91,7 @@ class Scene:
         if folder.is_file():
             raise UserError(f"{folder}: is a file; give the folder of the run, such as {folder.parent}")
         if not folder.is_dir():
-            raise UserError(f"{folder}: no such run directory; apps/train.py --output makes one")
+            raise UserError(f"{folder}: no such run folder; apps/train.py --output makes one")
         tensors, metadata = checkpoint.read(folder, ("gaussians.", "motion."))
         scene = scene_from(tensors, metadata, device, str(folder / checkpoint.FILE))
         scene.folder = folder

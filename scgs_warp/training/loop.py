@@ -56,13 +56,13 @@ def fit(
     group: ProcessGroup | None = None,
     watcher: Watcher | None = None,
 ) -> Scene:
-    """Train a scene; the run directory holds a resumable checkpoint at any time.
+    """Train a scene; the run folder holds a resumable checkpoint at any time.
 
     Args:
         config: the complete configuration: a ``config.preset``, possibly changed by ``config.with_steps`` and
             ``from_dict``.
         data: training frames in world units (``data.load``).
-        output: run directory; created if it does not exist.
+        output: run folder; created if it does not exist.
         device: ``cpu`` or ``cuda``, for all computation.
         test: held-out frames for the curve and the previews; they do not influence the training.
         resume: continue from the checkpoint in ``output``; the result is bit-identical to that of an uninterrupted run.

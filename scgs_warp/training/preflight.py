@@ -46,7 +46,7 @@ def refuse_early(config: TrainConfig, output: Path, resume: bool) -> None:
     if not resume:
         return
     if not output.is_dir():
-        raise UserError(f"{output}: no such run directory; give one that apps/train.py wrote, or no --resume")
+        raise UserError(f"{output}: no such run folder; give one that apps/train.py wrote, or no --resume")
     if not (output / checkpoint.FILE).is_file():
         return
     try:

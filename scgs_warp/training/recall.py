@@ -4,7 +4,7 @@ Nothing else would move them: what is not drawn has no gradient. Large steps of 
 opacity reset, can carry all of them behind the camera.
 
 On a GPU the host knows the result of a step only when it starts the second one after it, and it must wait for each step
-that may draw back. Such steps therefore form a :class:`Window`, on every device the same.
+that may draw back. Such steps therefore form a :class:`RecallPeriod`, on every device the same.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ LEAST_DIFFERENCE = 1e-4
 """Difference from the truth above which an empty picture should show something."""
 
 
-class Window(NamedTuple):
+class RecallPeriod(NamedTuple):
     """Steps that may draw back: from ``begin`` to ``end``, which is excluded."""
 
     begin: int = 0
@@ -34,10 +34,10 @@ class Window(NamedTuple):
     def holds(self, step: int) -> bool:
         return self.begin <= step < self.end
 
-    def after_nothing_shown(self, step: int) -> Window:
-        """Return the window once the view of ``step`` has shown nothing."""
+    def after_nothing_shown(self, step: int) -> RecallPeriod:
+        """Return the period once the view of ``step`` has shown nothing."""
         first = step + KNOWN_AFTER
-        return Window(self.begin if first <= self.end else first, step + LASTS)
+        return RecallPeriod(self.begin if first <= self.end else first, step + LASTS)
 
 
 def shows_too_little(shown: float, l1: float) -> bool:

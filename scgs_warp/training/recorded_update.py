@@ -15,7 +15,7 @@ from ..kernels.types import STEP_FINE
 from ..ops.binning_cuda import bin_within
 from ..ops.step_outcome import Moments, StepOutcome, UpdateTable
 from ..optim import ADAM_BETAS, ADAM_EPS, Group
-from ..runtime.cuda_graph import CudaGraph, GraphMemory, Steps
+from ..runtime.cuda_graph import CudaGraph, GraphMemory, PlainGraph
 from ..runtime.device_copies import pinned, sent
 from ..types import Camera, Splats, Tiles
 from .depth import SeenDepth
@@ -78,7 +78,7 @@ class RecordedUpdate:
         """True if there was too little memory for a recording."""
         self._kinds: dict[Hashable, Kind] = {}
         self._seen: Counter[Hashable] = Counter()
-        self._recorded: dict[Hashable, CudaGraph | Steps] = {}
+        self._recorded: dict[Hashable, CudaGraph | PlainGraph] = {}
         self._buffers: dict[Hashable, View] = {}
 
     def holds(self) -> bool:
@@ -156,9 +156,9 @@ class RecordedUpdate:
                 to.copy_(values)
         return view._replace(truth=kept.truth, mask=kept.mask, sample=kept.sample, depth=kept.depth)
 
-    def _record(self, key: Hashable, body: Callable[[], Any]) -> CudaGraph | Steps | None:
+    def _record(self, key: Hashable, body: Callable[[], Any]) -> CudaGraph | PlainGraph | None:
         if self._device.type != "cuda":
-            recorded: CudaGraph | Steps = Steps(body)
+            recorded: CudaGraph | PlainGraph = PlainGraph(body)
         else:
             # Nothing may be committed by a capture that runs the operations, as that of the pretended device does.
             halted = self.outcome.halted.clone()

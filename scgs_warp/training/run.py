@@ -89,7 +89,7 @@ def train_and_evaluate(
 
     Args:
         data: folder of the data set; trains on its train split, evaluates on its test split.
-        output: run directory.
+        output: run folder.
         resume: continue the run in ``output``.
         frames: length of the turntable; 0: none.
         lpips: the perceptual distance; None: not measured.
@@ -103,7 +103,7 @@ def train_and_evaluate(
         the content of ``metrics.json``; empty in processes other than the first.
 
     Raises:
-        UserError: from the data, the configuration, the run directory or the training; or scores and pictures cannot be
+        UserError: from the data, the configuration, the run folder or the training; or scores and pictures cannot be
             written afterwards.
         KeyboardInterrupt: after Ctrl-C, SIGTERM or the end of the terminal; the checkpoint is saved.
     """
@@ -147,7 +147,7 @@ def write_results(
     Args:
         scene: result of the training.
         test: held-out frames.
-        folder: the run directory; ``metrics.json``, ``contact_sheet.png``, ``curves.png``, ``turntable.mp4``,
+        folder: the run folder; ``metrics.json``, ``contact_sheet.png``, ``curves.png``, ``turntable.mp4``,
             ``evaluation/`` go there.
         frames: length of the turntable; 0: none.
         lpips: the perceptual distance; None: not measured.

@@ -1,4 +1,4 @@
-"""A run directory: config.json, log.jsonl, previews/, and a lock that admits only one trainer."""
+"""A run folder: config.json, log.jsonl, previews/, and a lock that admits only one trainer."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ PARTIAL = re.compile(
 )
 """Names of files that a killed trainer leaves behind half written."""
 BEFORE_SETTINGS = {PREVIEWS, LOCK}
-"""What a run directory holds before ``config.json``."""
+"""What a run folder holds before ``config.json``."""
 TEST_IMAGES = 4
 """Approximate number of held-out images on which the curve is measured."""
 BOARD_IMAGES = 20
@@ -77,7 +77,7 @@ def _has_settings(path: Path) -> bool:
 
 
 class RunFolder:
-    """Run directory of a trainer: a context manager that holds a lock, so that two trainers cannot share the directory.
+    """Run folder of a trainer: a context manager that holds a lock, so that two trainers cannot share it.
 
     With ``tensorboard``, the log's entries and occasional pictures are also written to event files. Log, previews,
     event files and the scores of held-out frames are optional: if writing one of them fails, training warns once and
@@ -121,7 +121,7 @@ class RunFolder:
 
     def __enter__(self) -> RunFolder:
         if self.resume and not self.path.is_dir():
-            raise UserError(f"{self.path}: no such run directory; give one that apps/train.py wrote, or no --resume")
+            raise UserError(f"{self.path}: no such run folder; give one that apps/train.py wrote, or no --resume")
         try:
             (self.path / PREVIEWS).mkdir(parents=True, exist_ok=True)
             self._lock()
@@ -307,7 +307,7 @@ class RunFolder:
 
 
 class ReadOnlyRunFolder(RunFolder):
-    """Run directory in processes other than the first: writes nothing."""
+    """Run folder in processes other than the first: writes nothing."""
 
     def __enter__(self) -> ReadOnlyRunFolder:
         return self

@@ -37,7 +37,7 @@ from .initial_models import (
 )
 from .initial_points import initial_points
 from .process_group import ProcessGroup
-from .recall import Window
+from .recall import RecallPeriod
 from .resuming import check_same_configuration, check_same_frames, check_steps
 from .scene_distance import place
 from .silhouettes import half_thickness
@@ -96,7 +96,7 @@ class TrainState:
         self.stage: Stage = stage
         self.step, self.fingerprint = step, fingerprint
         self.failures = 0
-        self.recalls = Window()
+        self.recalls = RecallPeriod()
         """Steps that may draw back Gaussians, if a step has a single view."""
         self.group: ProcessGroup | None = None
         """Processes that share each step's views; not part of a checkpoint."""
@@ -292,7 +292,7 @@ class TrainState:
             stats = checkpoint.strip(tensors, "stats.")
             state.stats = Stats(stats["grad_norm"], stats["count"], stats["max_radii"], absolute=state.stats.absolute)
             state.failures = int(metadata["failures"])
-            state.recalls = Window(*map(int, metadata.get("recalls", ())))
+            state.recalls = RecallPeriod(*map(int, metadata.get("recalls", ())))
         except (KeyError, IndexError, ValueError, RuntimeError, TypeError) as error:
             raise UserError(f"{source}: cannot be resumed ({reason(error)}); train again without --resume") from error
         state.motion.eval()

@@ -40,13 +40,13 @@ def check_installed() -> None:
 
 
 class TensorBoard:
-    """Event files of one run directory.
+    """Event files of one run folder.
 
     A resumed run writes a new file, which withdraws the earlier file's values for the steps to be repeated. Log entries
     missing from the files (because the run was killed, or partly ran without TensorBoard) are added.
 
     Args:
-        folder: the run directory.
+        folder: the run folder.
         entries: the entries of ``log.jsonl`` up to ``step``.
         step: number of steps done.
         seconds: seconds of training so far.

@@ -1,4 +1,4 @@
-"""Run directories: checkpoints to load and to resume, logs, settings, cells of ablations."""
+"""Run folders: checkpoints to load and to resume, logs, settings, cells of ablations."""
 
 from __future__ import annotations
 

@@ -17,7 +17,7 @@ from scgs_warp.storage import checkpoint
 
 
 def save(scene: Scene, folder: Path) -> Path:
-    """A run directory that ``Scene.load`` reads; the network is what it is."""
+    """A run folder that ``Scene.load`` reads; the network is what it is."""
     folder.mkdir()
     checkpoint.write(folder, scene.tensors(), {**scene.metadata(), "stage": "main"})
     (folder / "config.json").write_text(json.dumps(scene.settings))

@@ -102,7 +102,7 @@ def test_what_cannot_be_shown_is_refused(view, tmp_path):
     (tmp_path / "checkpoint.safetensors").touch()
     with pytest.raises(UserError, match=f"is a file; give the folder of the run, such as {tmp_path}"):
         view_run(tmp_path / "checkpoint.safetensors", view, "cpu")
-    with pytest.raises(UserError, match="no such run directory"):
+    with pytest.raises(UserError, match="no such run folder"):
         view_run(tmp_path / "missing", view, "cpu")
     with pytest.raises(UserError, match="no such file"):
         view_file(tmp_path / "missing.ply", view, "cpu")

@@ -59,7 +59,7 @@ class Overwriting:
 
 @pytest.fixture(autouse=True)
 def graphs_overwrite(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(frame_graph, "Steps", Overwriting)
+    monkeypatch.setattr(frame_graph, "PlainGraph", Overwriting)
 
 
 @pytest.mark.parametrize("model", MOTIONS)

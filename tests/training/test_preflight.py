@@ -41,7 +41,7 @@ def test_what_can_be_refused_without_the_data(run, tmp_path):
         (wider, run, True, "made with motion.width = 32, now 64"),
         (fewer, run, True, "is at step 40 already, beyond --steps 30"),
         (small, tmp_path / "new", False, "--nodes 2"),
-        (config, tmp_path / "none", True, "no such run directory"),
+        (config, tmp_path / "none", True, "no such run folder"),
     ):
         with pytest.raises(UserError, match=expected):
             refuse_early(settings, folder, resume)

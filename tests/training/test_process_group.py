@@ -158,7 +158,7 @@ SMALL = ["--steps", "24", "--nodes", "8", "--set", "init_points=200", "--set", "
 
 
 def test_torchrun_trains(tmp_path):
-    """As the user does it: one view for each process and step, one voice, one run directory."""
+    """As the user does it: one view for each process and step, one voice, one run folder."""
     data = write_dnerf(tmp_path / "data", 32)
     command = [*TORCHRUN, "apps/train.py", "--data", str(data), "--output", str(tmp_path / "run"), "--device", "cpu"]
     environ = {**os.environ, **PATHS}

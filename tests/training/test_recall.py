@@ -13,7 +13,7 @@ from scgs_warp import optim
 from scgs_warp.geometry.normalisation import COMMON_RADIUS
 from scgs_warp.ops.adam import adam_step
 from scgs_warp.training.frames import Frames
-from scgs_warp.training.recall import Window, recall, shows_too_little
+from scgs_warp.training.recall import RecallPeriod, recall, shows_too_little
 from scgs_warp.training.recorded_step import RecordedSteps
 from scgs_warp.training.state import TrainState
 from scgs_warp.training.step import training_step
@@ -82,7 +82,7 @@ def test_a_step_of_several_views_draws_back_at_once():
     before = distance(state)
     training_step(state, frames)
     assert distance(state) < before
-    assert state.recalls == Window(), "processes see other views, and keep no window"
+    assert state.recalls == RecallPeriod(), "processes see other views, and keep no period"
 
 
 def test_a_resumed_run_draws_back_at_the_same_steps(tmp_path):
@@ -92,19 +92,19 @@ def test_a_resumed_run_draws_back_at_the_same_steps(tmp_path):
     state.step += 1
     state.save(tmp_path)
     resumed = TrainState.resume(tmp_path, state.config, frames.data, "cpu")
-    assert resumed.recalls == state.recalls == Window(2, 50)
+    assert resumed.recalls == state.recalls == RecallPeriod(2, 50)
 
 
 def test_the_window_lasts_as_long_as_views_show_nothing():
-    window = Window().after_nothing_shown(10)
-    assert [step for step in range(100) if window.holds(step)] == list(range(12, 60))
+    period = RecallPeriod().after_nothing_shown(10)
+    assert [step for step in range(100) if period.holds(step)] == list(range(12, 60))
     for step in range(11, 71):  # whether the step before is known yet makes no difference
-        later = window.after_nothing_shown(step)
-        assert later.holds(step + 1) == window.holds(step + 1) or step >= 58
-        window = later
-    assert window == Window(12, 120)
-    assert window.after_nothing_shown(118) == Window(12, 168)
-    assert window.after_nothing_shown(119) == Window(121, 169)
+        later = period.after_nothing_shown(step)
+        assert later.holds(step + 1) == period.holds(step + 1) or step >= 58
+        period = later
+    assert period == RecallPeriod(12, 120)
+    assert period.after_nothing_shown(118) == RecallPeriod(12, 168)
+    assert period.after_nothing_shown(119) == RecallPeriod(121, 169)
 
 
 def test_only_distant_and_finite_gaussians_are_drawn_back():
