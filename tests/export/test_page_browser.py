@@ -6,8 +6,7 @@ import base64
 import dataclasses
 import io
 import threading
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
 from typing import Any
@@ -16,8 +15,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from helpers import page_visits
 from helpers.chromium import chromium, lose_context, restore_context
 from helpers.edit_scenes import bar_scene, rich_scene, tinted_scene
+from helpers.page_visits import RENDER, SIZE, psnr, until
 from helpers.touch import Touch
 from scgs_warp.export.page import write_page
 from scgs_warp.export.request import ExportRequest
@@ -26,45 +27,19 @@ from scgs_warp.geometry.cameras import orbit_camera
 from scgs_warp.motion import build_motion
 from scgs_warp.scene.from_gaussians import open_gaussians, with_control_points
 from scgs_warp.scene.scene import Scene
-from scgs_warp.types import Camera
 
-PATIENCE = 60.0
-SIZE = {"width": 640, "height": 520}
 ROWS = slice(40, 400)  # of the window: below the title, above the panel
-RENDER = """async ([time, viewmat, K, width, height, background]) => {
-  const { pixels } = await window.scgs.renderAt(time, viewmat, K, width, height, background);
-  let text = "";
-  for (let i = 0; i < pixels.length; i += 8192) text += String.fromCharCode(...pixels.subarray(i, i + 8192));
-  return btoa(text);
-}"""
 STATE = """() => window.scgs.ready.then(({ player: p, clock: c }) => ({ time: p.time, playing: c.playing,
   azimuth: p.orbit.azimuth, elevation: p.orbit.elevation, distance: p.orbit.distance, target: p.orbit.target,
   idle: !p.stale && !p.unsorted && !p.sorting && !p.moving, frames: p.frames, worker: p.worker !== null,
   size: [p.canvas.width, p.canvas.height] }))"""
 
 
-def until(condition: Callable[[], Any]) -> None:
-    end = time.monotonic() + PATIENCE
-    while not condition():
-        assert time.monotonic() < end, "waited in vain"
-        time.sleep(0.05)
-
-
-class Visit:
-    """One visit of a page; whatever it logs or asks for is kept."""
+class Visit(page_visits.Visit):
+    """A visit of a page that plays, which may fail to become ready."""
 
     def __init__(self, browser: Any, path: Path, *, prepare: str = "", **context: Any) -> None:
-        self.context = browser.new_context(viewport=SIZE, **context)
-        self.page = self.context.new_page()
-        self.page.set_default_timeout(1e3 * PATIENCE)
-        self.problems: list[str] = []
-        self.requests: list[str] = []
-        self.page.on("pageerror", lambda error: self.problems.append(str(error)))
-        self.page.on("console", lambda m: self.problems.append(m.text) if m.type == "error" else None)
-        self.page.on("request", lambda request: self.requests.append(request.url))
-        if prepare:
-            self.page.add_init_script(prepare)
-        self.page.goto(path.as_uri())
+        super().__init__(browser, path, "", prepare=prepare, awaited=False, **context)
 
     def still(self) -> None:
         """Stop the film and wait for the last frame."""
@@ -79,15 +54,6 @@ class Visit:
         until(lambda: self.state()["idle"])
         image = Image.open(io.BytesIO(self.page.screenshot())).convert("RGB")
         return np.asarray(image, np.float64)[ROWS] / 255
-
-    def render(self, camera: Camera, moment: float) -> np.ndarray:
-        arguments = [moment, camera.viewmat.tolist(), camera.K.tolist(), camera.width, camera.height, [0, 0, 0]]
-        bytes_ = base64.b64decode(self.page.evaluate(RENDER, arguments))
-        return np.frombuffer(bytes_, np.uint8).reshape(camera.height, camera.width, 4)[..., :3] / 255
-
-
-def psnr(a: np.ndarray, b: np.ndarray) -> float:
-    return float(-10 * np.log10(((a - b) ** 2).mean()))
 
 
 def changed(a: np.ndarray, b: np.ndarray) -> float:

@@ -13,6 +13,7 @@ import numpy as np
 from scgs_warp.types import Camera
 
 PATIENCE = 90.0
+SIZE = {"width": 640, "height": 520}
 RENDER = """async ([time, viewmat, K, width, height, background]) => {
   const { pixels } = await window.scgs.renderAt(time, viewmat, K, width, height, background);
   let text = "";
@@ -29,11 +30,24 @@ def until(condition: Callable[[], Any]) -> None:
 
 
 class Visit:
-    """One visit of a page; whatever it logs or asks for is kept."""
+    """One visit of a page; whatever it logs or asks for is kept.
 
-    def __init__(self, browser: Any, path: Path, query: str = "?paused", **context: Any) -> None:
-        size = {"width": 640, "height": 520}
-        self.context = browser.new_context(viewport=size, **context)
+    Args:
+        prepare: script that runs before those of the page.
+        awaited: whether the page is to be ready at once.
+    """
+
+    def __init__(
+        self,
+        browser: Any,
+        path: Path,
+        query: str = "?paused",
+        *,
+        prepare: str = "",
+        awaited: bool = True,
+        **context: Any,
+    ) -> None:
+        self.context = browser.new_context(viewport=SIZE, **context)
         self.page = self.context.new_page()
         self.page.set_default_timeout(1e3 * PATIENCE)
         self.problems: list[str] = []
@@ -41,8 +55,11 @@ class Visit:
         self.page.on("pageerror", lambda error: self.problems.append(str(error)))
         self.page.on("console", lambda m: self.problems.append(m.text) if m.type == "error" else None)
         self.page.on("request", lambda request: self.requests.append(request.url))
+        if prepare:
+            self.page.add_init_script(prepare)
         self.page.goto(path.as_uri() + query)
-        self.page.evaluate("window.scgs.ready.then(() => 1)")
+        if awaited:
+            self.page.evaluate("window.scgs.ready.then(() => 1)")
 
     def ask(self, expression: str, argument: Any = None) -> Any:
         """Value of an expression in ``player``, ``clock`` and ``argument``."""
