@@ -57,7 +57,7 @@ def test_fifty_steps_as_torch_takes_them(seed, device):
 
 
 @pytest.mark.parametrize("form", FORMS)
-def test_forms(form, device):
+def test_each_form_is_adam_and_touches_nothing_else(form, device):
     """Sizes around registers and chunks; nothing beside a tensor is touched."""
     for size in (1, 15, 16, 17, 4095, 4096, 4097, 8193):
         buffers = [torch.randn(size + 8, generator=torch.Generator().manual_seed(i)).to(device) for i in range(4)]
@@ -164,7 +164,7 @@ def test_tensors_without_elements_keep_their_place(find, bad, device):
     assert find(tensors) == 1
 
 
-def test_nothing_to_do():
+def test_no_tensors_are_no_work():
     adam_step([])
     for find in (first_not_finite, first_not_finite_by_norm):
         assert find([]) is None
@@ -172,7 +172,7 @@ def test_nothing_to_do():
     adam_step([Update(*(torch.zeros(0, 3) for _ in range(4)), 1.0, 1)])
 
 
-def test_refusals():
+def test_tensors_that_do_not_fit_are_refused():
     good = [torch.zeros(4) for _ in range(4)]
     for index, name in enumerate(Update._fields[1:4], start=1):
         for wrong in (torch.zeros(5), torch.zeros(4, dtype=torch.float64)):

@@ -103,7 +103,7 @@ def star(edges_rest, edges_posed, device):
         ([[1.0, 0, 0], [1.0, 1e-7, 0]], [[1.0, 0, 0], [1.0, 1e-7, 0]]),
     ],
 )
-def test_degenerate_neighborhoods(device, rest, posed, scale):
+def test_degenerate_neighborhoods_have_rotations(device, rest, posed, scale):
     scaled = ([[scale * x for x in edge] for edge in edges] for edges in (rest, posed))
     tensors = star(*scaled, device)
     R = local_rotations(*tensors)
@@ -136,7 +136,7 @@ def test_poison_gives_valid_rotations(device):
     assert_rotations(R)
 
 
-def test_sizes(device):
+def test_empty_and_lonely_nodes_have_no_energy_and_wrong_arguments_are_refused(device):
     empty = torch.zeros(0, 3, device=device)
     none = torch.zeros(0, 4, dtype=torch.int32, device=device)
     assert arap_energy(empty, empty, none, torch.zeros(0, 4, device=device)).shape == (0,)
@@ -165,7 +165,7 @@ def test_same_bits_for_any_number_of_threads_and_with_given_lists(all_threads):
 
 
 @pytest.mark.parametrize(("times", "nodes", "count"), [(8, 60, 8), (1, 20, 3), (16, 300, 15), (4, 9, 8)])
-def test_trajectory_graph(device, times, nodes, count):
+def test_the_trajectory_graph_is_that_of_the_reference(device, times, nodes, count):
     trajectories = torch.randn(times, nodes, 3, generator=torch.Generator().manual_seed(times))
     neighbors, weights = trajectory_graph(trajectories.to(device), count)
     expected, expected_weights = twin.trajectory_graph(trajectories, count)

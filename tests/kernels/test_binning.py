@@ -66,12 +66,12 @@ def test_sharp_splats_reach_less_far(device: str, sharpness: float):
 
 
 @pytest.mark.parametrize("tile_size", [4, 8, 32])
-def test_other_tile_sizes(device: str, tile_size: int):
+def test_other_sizes_of_tiles_agree_with_the_definition(device: str, tile_size: int):
     check(random_splats(5, 60, 50, 37, device), tile_size)
 
 
 @pytest.mark.parametrize("count", [0, 1])
-def test_few(device: str, count: int):
+def test_none_and_one_are_listed(device: str, count: int):
     tiles = check(random_splats(1, count, 40, 40, device))
     assert tiles.ranges.shape == (9, 2)
 
@@ -84,7 +84,7 @@ def test_few(device: str, count: int):
     log_scale=st.integers(-3, 6),
     aspect=st.integers(0, 4),
 )
-def test_any_shape(seed: int, width: int, height: int, log_scale: int, aspect: int):
+def test_random_shapes_are_listed_in_all_their_tiles(seed: int, width: int, height: int, log_scale: int, aspect: int):
     check(random_splats(seed, 12, width, height, log_scale=log_scale, aspect=aspect))
 
 
@@ -249,7 +249,7 @@ def test_splats_that_leave_out_a_row_of_tiles_between_others(monkeypatch: pytest
     assert assert_both_sorts_agree(splats) > n
 
 
-def test_all_culled(device: str):
+def test_lists_are_empty_if_all_splats_are_culled(device: str):
     splats = random_splats(14, 500, 100, 60, device)
     tiles = bin_splats(replace(splats, radii=torch.zeros_like(splats.radii)))
     assert len(tiles.splats) == len(tiles.slots) == 0
@@ -271,7 +271,7 @@ def test_neither_threads_nor_chunks_change_anything(all_threads: None, monkeypat
             assert torch.equal(getattr(results[0], name), getattr(result, name)), name
 
 
-def test_wrong_arguments():
+def test_wrong_arguments_are_refused():
     splats = random_splats(0, 3, 20, 20)
     with pytest.raises(ValueError, match="conics must be"):
         bin_splats(replace(splats, conics=splats.conics[:2]))
@@ -279,7 +279,7 @@ def test_wrong_arguments():
         bin_splats(replace(splats, width=0))
 
 
-def test_too_many_pairs():
+def test_too_many_pairs_are_refused_before_they_are_allocated():
     """Counted in 64 bits and refused, before anything of that size is allocated."""
     splats = random_splats(0, 3000, 16, 16, log_scale=0.0)
     conics = torch.tensor([1e-9, 0.0, 1e-9]).expand(3000, 3)

@@ -139,7 +139,7 @@ def test_a_cubin_is_read_and_nothing_else(taken):
         (32, 100 * 1024, 90, 0.25),
     ],
 )
-def test_occupancy(registers, shared, architecture, share):
+def test_occupancy_is_limited_by_registers_and_by_shared_memory(registers, shared, architecture, share):
     own = cubins.Resources(registers, 0, shared, 0)
     assert cubins.occupancy(own, architecture) == pytest.approx(share)
 

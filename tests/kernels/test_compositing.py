@@ -33,13 +33,13 @@ from scgs_warp.types import Splats, Stats, Tiles
 
 
 @pytest.mark.parametrize("c", [1, 3, 4, 5, 8, 11])
-def test_channels(device: str, c: int):
+def test_any_number_of_channels_agrees_with_float64(device: str, c: int):
     check(random_splats(c, 200, 50, 40, device), random_channels(c, 200, c, device), c, device)
 
 
 @pytest.mark.parametrize("size", [(1, 1), (17, 33), (16, 16), (33, 15), (100, 3)])
 @pytest.mark.parametrize("seed", range(2))
-def test_sizes(device: str, seed: int, size: tuple[int, int]):
+def test_any_size_agrees_with_float64(device: str, seed: int, size: tuple[int, int]):
     check(random_splats(seed, 120, *size, device), random_channels(seed, 120, 4, device), seed, device)
 
 
@@ -54,7 +54,7 @@ def test_sizes(device: str, seed: int, size: tuple[int, int]):
     ],
     ids=["opaque", "faint", "huge", "tiny", "needles"],
 )
-def test_extremes(device: str, kind: dict):
+def test_extreme_splats_agree_with_float64(device: str, kind: dict):
     check(random_splats(11, 250, 48, 40, device, **kind), random_channels(11, 250, 4, device), 11, device)
 
 
@@ -64,7 +64,7 @@ def test_extremes(device: str, kind: dict):
     [{}, {"opacity": (1.0, 1.0)}, {"opacity": (0.0, 0.02)}, {"log_scale": 4.0}, {"log_scale": 2.0, "aspect": 2.0}],
     ids=["mixed", "opaque", "faint", "huge", "needles"],
 )
-def test_sharpness(device: str, kind: dict, sharpness: float):
+def test_sharp_splats_agree_with_float64_and_differ_from_gaussians(device: str, kind: dict, sharpness: float):
     splats = random_splats(12, 250, 48, 40, device, sharpness=sharpness, **kind)
     channels = random_channels(12, 250, 4, device)
     check(splats, channels, 12, device)
@@ -74,7 +74,7 @@ def test_sharpness(device: str, kind: dict, sharpness: float):
 
 
 @pytest.mark.parametrize("n", [0, 1])
-def test_few(device: str, n: int):
+def test_none_and_one_agree_with_float64(device: str, n: int):
     splats = random_splats(3, n, 20, 20, device, opacity=(0.5, 0.9))
     splats = replace(splats, means2d=torch.full_like(splats.means2d, 9.0))
     check(splats, random_channels(3, n, 3, device), 3, device)
@@ -90,7 +90,9 @@ def test_few(device: str, n: int):
     log_scale=st.integers(-1, 4),
     sharpness=st.sampled_from([0.0, 0.5, 2.0]),
 )
-def test_any_scene(seed: int, n: int, width: int, height: int, c: int, log_scale: int, sharpness: float):
+def test_random_scenes_agree_with_float64(
+    seed: int, n: int, width: int, height: int, c: int, log_scale: int, sharpness: float
+):
     splats = random_splats(seed, n, width, height, log_scale=log_scale, sharpness=sharpness)
     channels, background = random_channels(seed, n, c), torch.rand(c)
     tiles = bin_splats(splats)
@@ -146,7 +148,7 @@ def backward_buffers(splats: Splats, channels: Tensor, form: str, absolute: bool
 
 @pytest.mark.parametrize("absolute", [False, True])
 @pytest.mark.parametrize("c", [3, 9])
-def test_stats_and_absgrad(device: str, absolute: bool, c: int):
+def test_stats_and_absolute_gradients_agree_with_float64(device: str, absolute: bool, c: int):
     splats, channels = random_splats(9, 90, 40, 24, device), random_channels(9, 90, c, device)
     splats = replace(splats, radii=splats.radii * (torch.arange(90, device=device) % 7 != 0)[:, None].int())
     saved: dict = {}
@@ -268,7 +270,7 @@ def test_crop_of_the_twin():
     assert torch.allclose(whole[:, 7:33, 5:37], crop, atol=1e-14)
 
 
-def test_wrong_arguments():
+def test_wrong_arguments_are_refused():
     splats, channels = random_splats(0, 5, 20, 20), random_channels(0, 5, 3)
     tiles = bin_splats(splats)
     with pytest.raises(ValueError, match="channels must be"):

@@ -55,7 +55,7 @@ def ledger_of(processor: str, stages: Sequence[str], folder: Path) -> dict[str, 
     return json.loads((folder / "ledger.json").read_text(encoding="utf-8"))
 
 
-def test_one_stage(tmp_path):
+def test_one_stage_agrees_on_avx2(tmp_path):
     ledger = ledger_of("avx2", ["adam"], tmp_path)
     assert ledger["adam.adam_step"]["launches"] > 0
     assert ledger["adam.adam_step"]["largest_difference"] < 1e-6
@@ -64,7 +64,7 @@ def test_one_stage(tmp_path):
 @pytest.mark.slow
 @pytest.mark.timeout(3600)
 @pytest.mark.parametrize("processor", PROCESSORS)
-def test_all_stages(processor, tmp_path):
+def test_all_stages_agree_on_other_processors(processor, tmp_path):
     ledger = ledger_of(processor, STAGES, tmp_path)
     for kernel, row in ledger.items():
         print(f"{processor} {kernel}: {row}")

@@ -25,7 +25,7 @@ def lines(data: Dataset, **changes) -> tuple[str, str]:
     return found
 
 
-def test_survey_counts():
+def test_a_survey_counts_frames_times_and_turns():
     found = survey(handheld(41, 2.0))
     assert (found.frames, found.width, found.height, found.instants, found.views) == (41, 32, 24, 41, 1)
     assert found.arc == pytest.approx(80, abs=2) and found.turn == pytest.approx(2, abs=0.1)
@@ -33,7 +33,7 @@ def test_survey_counts():
     assert found.typical_gap == pytest.approx(1 / 40)
 
 
-def test_a_slow_camera():
+def test_the_lines_describe_one_camera_that_moves_slowly():
     first, second = lines(handheld(41, 2.0))
     assert first == (
         "data: 41 frames of 32 x 24 at 41 times; one camera, 2.0 degrees from frame to frame, 79 in all; "
@@ -42,7 +42,7 @@ def test_a_slow_camera():
     assert "motion along the line of sight" in second and "COLMAP's points" in second
 
 
-def test_hardly_any_parallax():
+def test_hardly_any_parallax_is_told():
     assert "leaves depth unknown" in lines(handheld(30, 0.1))[1]
 
 
@@ -87,7 +87,7 @@ def rig(own_moments: float = 0.0, flicker: float = 0.0, moments: int = 8, then: 
 
 
 @pytest.mark.parametrize("own_moments", [0.0, 0.05, 0.1, 0.2, 0.5])
-def test_a_rig(own_moments):
+def test_cameras_that_stand_still_are_told_from_one_that_moves(own_moments):
     """Cameras that are not locked have few instants in common; they differ in brightness, but none of them flickers."""
     data = rig(own_moments)
     found = survey(data)
@@ -118,14 +118,14 @@ def test_a_batch_sees_frames_more_often():
     assert "--steps 10000" in advise(dataclasses.replace(facts, frames=1000), dataclasses.replace(config, batch=2))[1]
 
 
-def test_what_is_no_rig():
+def test_a_camera_that_moves_or_was_moved_is_no_rig():
     assert survey(handheld(41, 2.0)).standing == 0 and survey(rig(0.2, moments=3)).standing == 0
     moved = rig(then=1.5)
     assert survey(moved).standing == 0, "one camera that was moved twice"
     assert "that stand still" not in lines(moved)[0]
 
 
-def test_exposure():
+def test_changing_brightness_is_told_and_black_images_are_none():
     assert "brightness changes by 20 %" in lines(handheld(exposure=0.2))[1]
     assert "brightness" not in lines(handheld(exposure=0.04))[1]
     dark = [dataclasses.replace(f, alpha=torch.zeros(24, 32), image=f.image * 0) for f in handheld(10, alpha=True)]
@@ -171,7 +171,7 @@ def test_a_camera_that_is_elsewhere_at_each_instant():
     assert "cut out by alpha" in first and "stands elsewhere" in second and "--progressive" not in second
 
 
-def test_steps_and_sizes():
+def test_too_few_steps_and_large_images_are_told():
     assert "--steps 1000 sees" in lines(handheld(40), steps=400)[1]
     found = survey(handheld(40))
     large = dataclasses.replace(found, width=4000, height=3000)
@@ -179,19 +179,19 @@ def test_steps_and_sizes():
     assert "--downscale" not in advise(large, preset("cpu"), "cuda")[1]
 
 
-def test_poses(tmp_path):
+def test_poses_of_colmap_may_be_refined(tmp_path):
     write_colmap(tmp_path)
     first, second = lines(load(tmp_path))
     assert "24 points" in first and "--set optim.cameras=2e-4" in second
 
 
-def test_many_views(tmp_path):
+def test_several_views_of_an_instant_are_told(tmp_path):
     write_poses_bounds(tmp_path)
     first, second = lines(load(tmp_path))
     assert "3 views of each instant" in first and "each instant is seen from several sides" in second
 
 
-def test_a_single_frame():
+def test_a_single_frame_is_surveyed():
     assert survey(handheld(1)).instants == 1 and isinstance(survey(handheld(1)), Survey)
     assert len(lines(handheld(1))) == 2
 

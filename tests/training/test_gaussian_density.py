@@ -47,7 +47,7 @@ def test_pruning_everything_keeps_the_most_opaque(device):
     assert len(gaussians) == 1
 
 
-def test_opacity_reset(device):
+def test_an_opacity_reset_limits_opacities_and_forgets_their_moments(device):
     gaussians, optimizer = make(3, device)
     reset_opacities(gaussians, optimizer)
     assert float(gaussians.opacities().detach().max()) <= RESET_OPACITY + 1e-6

@@ -89,7 +89,7 @@ def test_the_curve_does_not_show_opacity_resets(tmp_path, monkeypatch):
     assert all(most > 2 * RESET_OPACITY for _, most in looks), looks
 
 
-def test_checkpoint_round_trip(tmp_path, device):
+def test_a_trained_scene_renders_the_same_bits_after_loading(tmp_path, device):
     data = tiny_dataset(6)
     scene = fit(tiny_config(40), data, output=tmp_path / "run", device=device)
     scene.freeze_binding()
@@ -102,7 +102,7 @@ def test_checkpoint_round_trip(tmp_path, device):
     assert loaded.control_points_at(0.3).shape == (loaded.control_point_count, 3)
 
 
-def test_interrupt_saves(tmp_path, monkeypatch):
+def test_a_run_that_is_stopped_by_sigterm_resumes_to_the_same_bits(tmp_path, monkeypatch):
     data = tiny_dataset(6)
     step = loop.training_step
 
@@ -193,7 +193,7 @@ def test_rates_and_thresholds_may_be_zero(field, tmp_path):
     assert scene.step == 60
 
 
-def test_refusals(tmp_path):
+def test_what_cannot_be_trained_or_resumed_is_refused(tmp_path):
     data = tiny_dataset(3)
     config = tiny_config(20)
     with pytest.raises(UserError, match="no frames"):

@@ -41,7 +41,7 @@ def test_a_folder_becomes_a_scene_and_a_run(tmp_path, monkeypatch, capsys):
     assert scene.turntable(tmp_path / "still", frames=2, size=32, time=0.5, show="alpha").is_dir()
 
 
-def test_frames_in_memory(tmp_path, capsys):
+def test_a_data_set_in_memory_trains(tmp_path, capsys):
     scene = scgs_warp.train(tiny_dataset(6), output=tmp_path / "run", **TINY)
     assert scene.step == 60 and "data: 6 frames of 48 x 48" in capsys.readouterr().out
 
@@ -56,7 +56,7 @@ def test_frames_in_memory(tmp_path, capsys):
         ({"data": "nowhere"}, "nowhere: no such folder"),
     ],
 )
-def test_mistakes(arguments, expected, tmp_path, monkeypatch):
+def test_mistakes_are_named_before_anything_is_written(arguments, expected, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(UserError, match=expected):
         scgs_warp.train(**{"data": tiny_dataset(2), "progress": False, **arguments})

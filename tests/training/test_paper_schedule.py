@@ -32,7 +32,7 @@ PAPER = preset("paper")
         *((9_999, 1.0007e-7), (10_000, 0.0), (69_999, 0.0)),
     ],
 )
-def test_arap(step, weight):
+def test_arap_decays_over_10000_steps(step, weight):
     assert arap_weight(step, PAPER.loss) == pytest.approx(weight, rel=1e-4)
 
 
@@ -49,7 +49,7 @@ def test_arap(step, weight):
         (69_999, 8e-6, 1.6e-6, 1.6e-7),
     ],
 )
-def test_rates_of_stage_2(step, means, network, positions):
+def test_rates_of_the_main_stage(step, means, network, positions):
     rates = rates_at("paper", "main", step)
     assert rates["means"] == pytest.approx(means, rel=1e-4)
     assert rates["network.head.weight"] == pytest.approx(network, rel=1e-4)
@@ -75,13 +75,13 @@ def test_rates_of_stage_1(step, means, network):
     ("step", "degree", "frozen"),
     [(0, 0, True), (999, 0, True), (1_000, 1, True), (2_000, 2, True), (2_999, 2, True), (3_000, 3, False)],
 )
-def test_harmonics_and_freeze(step, degree, frozen):
+def test_harmonics_grow_every_1000_steps_and_the_motion_thaws_at_3000(step, degree, frozen):
     state = at_step("paper", "main", step)
     assert sh_degree(state, step) == degree and motion_frozen(state) is frozen
     assert sh_degree(state, 69_999) == 3
 
 
-def test_density_of_stage_2():
+def test_density_of_the_main_stage():
     steps = range(1, PAPER.main_steps + 1)
     assert len(steps) == 70_000
     assert [done for done in steps if round_due(PAPER.densify, done)] == list(range(500, 50_001, 100))

@@ -200,7 +200,7 @@ def test_torchrun_and_a_killed_worker(tmp_path):
 
 
 @pytest.mark.slow
-def test_500_steps(tmp_path):
+def test_two_processes_hold_one_scene_and_train_as_one_does(tmp_path):
     for process in start(tmp_path, "long"):
         _, error = process.communicate(timeout=600)
         assert process.returncode == 0, error

@@ -103,7 +103,7 @@ def expected(steady: dict[str, float], factor: float) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize(("name", "row"), rows(STAGE_2))
-def test_rates_of_stage_2(name, row):
+def test_rates_of_the_main_stage(name, row):
     rates = rates_at(name, "main", row.step)
     networks = {rates.pop(key) for key in list(rates) if key.startswith("network.")}
     assert len(networks) == 1 and networks.pop() == pytest.approx(row.network, rel=1e-4)
@@ -160,7 +160,7 @@ MILESTONES: dict[PresetName, Milestones] = {
 
 
 @pytest.mark.parametrize("name", MILESTONES)
-def test_milestones_of_stage_2(name):
+def test_milestones_of_the_main_stage(name):
     table, config = MILESTONES[name], preset(name)
     growth, steps = config.densify, range(1, config.main_steps + 1)
     assert (config.main_steps, config.pretrain_steps) == (table.main_steps, table.pretrain_steps)
@@ -212,7 +212,7 @@ ARAP: dict[PresetName, list[tuple[int, float]]] = {
 
 
 @pytest.mark.parametrize("name", ARAP)
-def test_arap_weight(name):
+def test_arap_is_in_every_fifth_step_and_decays(name):
     """The term is in every fifth step, with five times the weight, and decays."""
     loss = preset(name).loss
     assert [arap_weight(step, loss) for step, _ in ARAP[name]] == pytest.approx([w for _, w in ARAP[name]], rel=1e-4)

@@ -98,7 +98,7 @@ def state_at(step: int) -> TrainState:
         (50, 8e-6, 2.5e-3 * SETTLED, 1.6e-6, 1.6e-7, 1e-5),
     ],
 )
-def test_learning_rates(step, means, sh_dc, network, positions, cameras):
+def test_learning_rates_follow_their_schedules(step, means, sh_dc, network, positions, cameras):
     """Stage 1 ends at step 10; control points, network and poses join five steps later."""
     state = state_at(step)
     assert state.motion_optimizer is not None

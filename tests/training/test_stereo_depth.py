@@ -168,7 +168,7 @@ def test_there_is_no_stereo_where_nothing_would_be_compared(film, lack):
     assert state.compared_stereo(data) is None
 
 
-def test_stage_1_of_a_resumed_run_still_has_the_depth_of_stage_2(film):
+def test_stage_1_of_a_resumed_run_still_has_the_depth_of_the_main_stage(film):
     """Its own step is beyond the share of the main stage in which depth is compared."""
     state = TrainState.begin(config(pretrain={"with_points": True, "steps": 36, "warm_up": 4}), film, "cpu")
     state.step = 34

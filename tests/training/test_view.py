@@ -36,11 +36,11 @@ def test_statistics_are_collected_until_densification_ends(step, collects):
 
 
 @pytest.mark.parametrize("stage_1", [True, False])
-@pytest.mark.parametrize("stage_2", ["always", "never"])
-def test_each_stage_has_its_own_pooled_residual(stage_1, stage_2):
-    changes = {"pretrain": {"pooled": stage_1}, "loss": {"pooled": stage_2}}
+@pytest.mark.parametrize("main", ["always", "never"])
+def test_each_stage_has_its_own_pooled_residual(stage_1, main):
+    changes = {"pretrain": {"pooled": stage_1}, "loss": {"pooled": main}}
     assert form_at(5, **changes).pooled == stage_1
-    assert form_at(15, **changes).pooled == (stage_2 == "always")
+    assert form_at(15, **changes).pooled == (main == "always")
 
 
 @pytest.mark.parametrize("stage_1", [True, False])

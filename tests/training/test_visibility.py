@@ -51,7 +51,7 @@ def test_nothing_of_the_hidden_the_broken_and_what_is_out_of_sight(device):
     assert in_view.tolist() == [True, True, True, False, False, False]
 
 
-def test_of_no_gaussians(device):
+def test_no_gaussians_contribute_nothing(device):
     weights, in_view = view_contributions(random_gaussians(0, 0, device), random_camera(0, 20, 30, device))
     assert weights.shape == in_view.shape == (0,)
 
