@@ -120,3 +120,4 @@ def test_sound_before_damage_is_used(tmp_path):
 def test_a_film_without_sound_has_none(tmp_path):
     write_film(tmp_path / "mute.mp4", [np.zeros((64, 64, 3), np.uint8)] * 8, 10.0, 30, None)
     assert read_sound(tmp_path / "mute.mp4") is None
+    assert SAMPLE_RATE == 48_000
