@@ -98,6 +98,7 @@ def show(metrics: dict[str, Any], unfinished: str | None) -> None:
     table = Table(title=f"{metrics['split']}, {metrics['images']} images, {where}")
     columns = {
         "psnr": "PSNR [dB]",
+        "mpsnr": "mPSNR [dB]",
         "psnr_median": "median",
         "psnr_worst": "worst",
         "psnr_fitted": "fitted colour",
@@ -113,6 +114,7 @@ def show(metrics: dict[str, Any], unfinished: str | None) -> None:
         table.add_column(columns[key], justify="right")
     digits = {
         "psnr": 2,
+        "mpsnr": 2,
         "psnr_median": 2,
         "psnr_worst": 2,
         "psnr_fitted": 2,

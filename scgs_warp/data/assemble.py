@@ -17,6 +17,7 @@ from ..errors import UserError
 from ..types import Camera
 from .borders import border_mask, reduce_mask
 from .cache import ImageCache, Pixels
+from .covisible import read_covisible
 from .dataset import Dataset, StoredFrame, spread
 from .depth_maps import DepthFile, read_depth_map
 from .far_origin import offset_of
@@ -47,6 +48,10 @@ class FrameRecord:
     states_size: bool = True
     """Whether the camera states the size of its images, which decides on the EXIF orientation."""
     depth: DepthFile | None = None
+    masked_by_alpha: bool = False
+    """Whether pixels of the image that are not opaque are not valid, instead of transparent."""
+    covisible: Path | None = None
+    """Mask of what training images show as well; None without one."""
 
 
 @dataclass(frozen=True)
@@ -127,7 +132,8 @@ def assemble(
                 "correct mask_path or the lens, give a smaller downscale or drop the frame"
             )
         read, depth = _reader(record, options), _depth_reader(record, fact)
-        views.append(StoredFrame(fact.camera, record.time, record.name, read, has_alpha, common, key, depth))
+        shown = _covisible_reader(record, fact)
+        views.append(StoredFrame(fact.camera, record.time, record.name, read, has_alpha, common, key, depth, shown))
     return Dataset(views, folder=folder, split=split, background=options.background, cache=cache, notes=notes)
 
 
@@ -143,7 +149,8 @@ def with_points(data: Dataset, points: np.ndarray | None, colors: np.ndarray | N
 
 
 def _decode(record: FrameRecord, options: ReadOptions) -> Decoded:
-    return read_image(record.file, options, record.lens, record.mask, record.states_size)
+    own = record.mask, record.states_size, record.masked_by_alpha
+    return read_image(record.file, options, record.lens, *own)
 
 
 def _reader(record: FrameRecord, options: ReadOptions) -> Callable[[], Pixels]:
@@ -156,6 +163,14 @@ def _depth_reader(record: FrameRecord, fact: _Facts) -> Callable[[], Tensor] | N
         return None
     lens = record.lens(fact.source) if fact.distorted else None
     return lambda: read_depth_map(file, fact.source, lens)
+
+
+def _covisible_reader(record: FrameRecord, fact: _Facts) -> Callable[[], Tensor] | None:
+    path = record.covisible
+    if path is None:
+        return None
+    lens = record.lens(fact.source) if fact.distorted else None
+    return lambda: read_covisible(path, fact.source, (fact.camera.width, fact.camera.height), lens)
 
 
 def _facts(record: FrameRecord, decoded: Decoded, border: np.ndarray | None) -> _Facts:

@@ -43,6 +43,8 @@ class StoredFrame:
     """Key of the pixels in the cache."""
     depth: Callable[[], Tensor] | None = None
     """Function that reads the frame's depth map, as ``Frame.depth``; None without one."""
+    covisible: Callable[[], Tensor] | None = None
+    """Function that reads the mask of what training images show as well, [H, W] bool; None without one."""
 
     def frame(self, cache: ImageCache) -> Frame:
         """Read the pixels.
@@ -154,6 +156,15 @@ class Dataset(Sequence[Frame]):
         """
         depth = self.entries[index].depth
         return depth() if callable(depth) else depth
+
+    def covisible(self, index: int) -> Tensor | None:
+        """Return [H, W] bool, True where training images show what a frame shows; None if the data do not tell.
+
+        Raises:
+            UserError: the file is missing or no mask, or does not fit its image.
+        """
+        entry = self.entries[index]
+        return entry.covisible() if isinstance(entry, StoredFrame) and entry.covisible is not None else None
 
     @property
     def with_depth(self) -> list[int]:

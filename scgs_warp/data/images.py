@@ -25,7 +25,7 @@ from ..storage.safe_paths import is_regular
 from .borders import reduce_mask
 from .cache import ImageCache, Pixels
 from .lens import Lens, undistort, valid_pixels
-from .mask_files import classes_of, is_in_alpha
+from .mask_files import by_alpha, classes_of, is_in_alpha
 from .orientation import TAG, UPRIGHT, read_orientation, swaps_sides, upright
 
 RESAMPLES = ("area", "bicubic")
@@ -151,6 +151,7 @@ def read_image(
     lens_of: Callable[[tuple[int, int]], Lens],
     mask_path: Path | None = None,
     states_size: bool = True,
+    masked_by_alpha: bool = False,
 ) -> Decoded:
     """Decode one file, undistort it, reduce it, and composite it on the background once.
 
@@ -162,6 +163,7 @@ def read_image(
         lens_of: function from the (width, height) of the file to the lens; raises UserError if the size does not fit.
         mask_path: an image that is black where the frame is not valid, and not black everywhere.
         states_size: whether the camera states the size of its images.
+        masked_by_alpha: whether pixels that are not opaque are not valid, instead of transparent.
 
     Raises:
         UserError: a file is missing or does not decode, or the mask has another size than the image.
@@ -170,6 +172,8 @@ def read_image(
     height, width = pixels.shape[:2]
     size = reduced_size(width, height, options.downscale, path)
     mask = None if mask_path is None else read_mask(mask_path, path, (width, height))
+    if masked_by_alpha:
+        pixels, mask = by_alpha(pixels, mask, OPAQUE)
     if lens.distorted:
         moved = valid_pixels(lens, width, height)
         mask = moved if mask is None else moved & (undistort(mask.astype(np.float32), lens) > 1.0 - 1e-4)

@@ -33,6 +33,20 @@ def classes_of(path: Path) -> np.ndarray | None:
     return classes if used[0] == 0 and len(used) > 1 and not tells_apart else None
 
 
+def by_alpha(pixels: np.ndarray, mask: np.ndarray | None, opaque: float) -> tuple[np.ndarray, np.ndarray | None]:
+    """Take alpha from the pixels [H, W, 3 or 4] of an image into its mask [H, W], None if every pixel is valid.
+
+    Args:
+        opaque: least alpha of valid pixels, in [0, 1].
+    """
+    if pixels.shape[2] == 3:
+        return pixels, mask
+    valid = pixels[..., 3] >= opaque * np.iinfo(pixels.dtype).max
+    if not valid.all():
+        mask = valid if mask is None else mask & valid
+    return np.ascontiguousarray(pixels[..., :3]), mask
+
+
 def is_in_alpha(path: Path, colors: Range, alphas: Range, white: float) -> bool:
     """Return whether masks are in their alpha channel, by the smallest and largest values of colours and of alpha.
 

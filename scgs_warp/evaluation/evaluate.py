@@ -64,13 +64,19 @@ def _color_scores(frame: Frame, image: Tensor, truth: Tensor, colors: FrameColor
     return scores
 
 
-def _measure(frame: Frame, image: Tensor, alpha: Tensor, truth: Tensor, lpips: Lpips | None) -> dict[str, Any]:
-    """Measure one image; ``image`` and ``truth`` are [H, W, 3] in [0, 1], ``alpha`` is [H, W], on the scene's
-    device."""
+def _measure(
+    frame: Frame, image: Tensor, alpha: Tensor, truth: Tensor, covisible: Tensor | None, lpips: Lpips | None
+) -> dict[str, Any]:
+    """Measure one image; ``image`` and ``truth`` are [H, W, 3] in [0, 1], ``alpha`` is [H, W], on the scene's device;
+    ``covisible`` is [H, W] bool."""
     mask = None if frame.mask is None else frame.mask.to(image.device)
     row: dict[str, Any] = {"name": frame.name, "time": float(frame.time)}
     row["psnr"] = _decibels(image, truth) if mask is None else _decibels(image[mask], truth[mask])
     row["ssim"] = float(ssim(image, truth, mask))
+    if covisible is not None:
+        seen = covisible.to(image.device) if mask is None else covisible.to(image.device) & mask
+        if bool(seen.any()):
+            row["mpsnr"] = _decibels(image[seen], truth[seen])
     if lpips is not None:
         if mask is not None:  # outside the mask the truth is unknown: show no difference
             image = torch.where(mask[..., None], image, truth)
@@ -164,12 +170,13 @@ def evaluate(
         fit_color: also score each image with the affine colour that fits it best.
 
     Returns:
-        ``psnr`` [dB], ``ssim``, ``lpips`` (None if not measured), ``images``; ``psnr_median``; ``psnr_worst`` and
+        ``psnr`` [dB], ``ssim``, ``lpips`` (None if not measured), ``images``; ``mpsnr``, if the data have masks of what
+        is covisible, the mean of the PSNR of the pixels that they mark; ``psnr_median``; ``psnr_worst`` and
         ``psnr_worst_time``, the lowest PSNR of an image and the image's time; with colours, ``psnr_fitted`` and
         ``ssim_fitted`` with the affine colour that fits each image best, and ``psnr_interpolated`` and
         ``ssim_interpolated`` with that of the training frames before and after; the fields of ``coverage.summarise``;
-        and ``per_image``, a list of ``name``, ``time``, ``psnr``, ``ssim`` (``lpips``; ``missing``, ``extra``,
-        ``missing_region``, ``extra_region`` if the image has alpha). The metrics of an empty split are None.
+        and ``per_image``, a list of ``name``, ``time``, ``psnr``, ``ssim`` (``mpsnr``, ``lpips``; ``missing``,
+        ``extra`` and their regions if the image has alpha). The metrics of an empty split are None.
 
     Raises:
         UserError: ``render_dir`` cannot be written.
@@ -182,7 +189,8 @@ def evaluate(
         rendered = scene.render(frame.camera, frame.time, background)
         image = rendered.rgb.clamp(0.0, 1.0)
         truth = frame.image.to(image.device).clamp(0.0, 1.0)
-        rows.append({**_measure(frame, image, rendered.alpha, truth, lpips), "name": names[index]})
+        row = _measure(frame, image, rendered.alpha, truth, dataset.covisible(index), lpips)
+        rows.append({**row, "name": names[index]})
         if colors is not None or fit_color:
             rows[-1].update(_color_scores(frame, image, truth, colors))
         if renders is not None:
@@ -194,6 +202,8 @@ def evaluate(
     if renders is not None:
         renders.finish()
     means = {name: _mean([row[name] for row in rows if name in row]) for name in ("psnr", "ssim", "lpips")}
+    if any("mpsnr" in row for row in rows):
+        means["mpsnr"] = _mean([row["mpsnr"] for row in rows if "mpsnr" in row])
     ways = [f"{score}_{way}" for way in ("fitted", "interpolated") for score in ("psnr", "ssim")]
     colored = {name: _mean([row[name] for row in rows]) for name in ways if rows and name in rows[0]}
     return {**means, **_spread_of_psnr(rows), **colored, **summarise(rows), "images": len(rows), "per_image": rows}

@@ -196,6 +196,7 @@ def summary(metrics: dict[str, Any]) -> str:
     not."""
     names = (
         "psnr",
+        "mpsnr",
         "psnr_fitted",
         "psnr_interpolated",
         "psnr_worst",

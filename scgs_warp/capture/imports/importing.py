@@ -9,10 +9,10 @@ from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import cv2
 import numpy as np
 
 from ...data.dataset import spread
+from ...data.depth_cloud import depth_cloud
 from ...data.held_out import held_out
 from ...data.images import size_text
 from ...data.orientation import UPRIGHT, read_orientation
@@ -35,10 +35,6 @@ POINT_FRAMES = 24
 """Number of frames whose depth gives points."""
 POINT_COUNT = 40_000
 """Number of points, from all these frames together."""
-RANGE = 20.0
-"""Depth gives points between the median divided by this and multiplied by it: sky and unknown depth do not."""
-EDGE = 0.1
-"""Relative difference of depth within 3 x 3 pixels beyond which they lie on an outline, where depth is blurred."""
 
 MAX_MOMENT = 1e19
 """Largest time of a frame, in the unit of the file: microseconds since 1970 are below it."""
@@ -143,7 +139,7 @@ def _write(work: Path, path: Path, scene: ImportedScene, show: ShowProgress) -> 
                 depth = checked_depth(frame.depth(), f"frame {index}")
                 maps.append(depths.write(Path(name).stem, depth, sizes[-1]))
                 if index in chosen:
-                    clouds.append(_cloud(frame, depth, image, share))
+                    clouds.append(depth_cloud(known_depth(depth), image, frame.K, frame.viewmat, share))
             else:
                 maps.append(None)
             bar.advance()
@@ -181,27 +177,6 @@ def _write_image(folder: Path, frame: ImportedFrame, stem: str) -> tuple[np.ndar
     image = frame.image()
     write_png(folder / f"{stem}.png", image)
     return image, f"{stem}.png"
-
-
-def _cloud(frame: ImportedFrame, depth: np.ndarray, image: np.ndarray, most: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return points [P, 3] in the world of the frame and their colours [P, 3] uint8, evenly over the image."""
-    known = known_depth(depth) > 0
-    middle = float(np.median(depth[known])) if known.any() else 0.0
-    known &= (depth > middle / RANGE) & (depth < middle * RANGE)
-    safe = np.where(known, depth, np.inf).astype(np.float32)
-    around = np.ones((3, 3))
-    low = cv2.erode(safe, around)
-    high = cv2.dilate(np.where(known, depth, 0.0).astype(np.float32), around)
-    known &= (high - low) < EDGE * safe
-    rows, columns = np.nonzero(known)
-    every = max(1, int(np.ceil(len(rows) / max(most, 1))))
-    rows, columns = rows[::every], columns[::every]
-    sx, sy = image.shape[1] / depth.shape[1], image.shape[0] / depth.shape[0]
-    x, y, z = (columns + 0.5) * sx, (rows + 0.5) * sy, depth[rows, columns]
-    local = np.stack([(x - frame.K[0, 2]) / frame.K[0, 0] * z, (y - frame.K[1, 2]) / frame.K[1, 1] * z, z], 1)
-    rotation, translation = frame.viewmat[:3, :3], frame.viewmat[:3, 3]
-    pixels = np.floor(y).astype(int).clip(0, image.shape[0] - 1), np.floor(x).astype(int).clip(0, image.shape[1] - 1)
-    return (local - translation) @ rotation, image[pixels]
 
 
 def _transforms(

@@ -7,7 +7,8 @@ older data; ``camera/ID.json``: ``orientation`` (world-to-camera, OpenCV), ``pos
 ``rgb/1x/ID.png``, ``rgb/2x`` ...
 Layout: Park et al., Nerfies, ICCV 2021; HyperNeRF, SIGGRAPH Asia 2021; Yan et al., NeRF-DS, CVPR 2023.
 
-The masks of NeRF-DS mark moving pixels, not invalid ones, and are ignored.
+The masks of NeRF-DS mark moving pixels, not invalid ones, and are ignored. DyCheck's iPhone data (:mod:`dycheck`) have
+splits, depth and masks of what is covisible, too.
 """
 
 from __future__ import annotations
@@ -26,9 +27,11 @@ from ...storage.numpy_files import read_npy
 from ..assemble import FrameRecord, assemble, with_points
 from ..choice import choose
 from ..dataset import Dataset
+from ..depth_maps import DepthFile
 from ..held_out import held_out
 from ..images import ReadOptions, size_text
 from ..lens import Lens, make_lens
+from . import dycheck
 
 FILE = "dataset.json"
 SUFFIXES = (".png", ".jpg", ".jpeg")
@@ -43,13 +46,29 @@ class World(NamedTuple):
     """Nearest and farthest depth of the content, scaled; None if the file does not tell."""
 
 
+class Listing(NamedTuple):
+    """Frames that a data set lists."""
+
+    path: Path
+    """File that lists them, named in messages."""
+    names: list[str]
+    train: list[str]
+    """Those to train on; empty: all that are not held out."""
+    held: list[str]
+    times: list[float]
+    """Of ``names``, in [0, 1]."""
+    cameras: list[str]
+    """Of ``names``; empty names if the data set has none."""
+
+
 def recognises(folder: Path) -> bool:
     """Return whether the folder holds this layout."""
-    return (folder / FILE).is_file() and (folder / "camera").is_dir()
+    return any((folder / name).is_file() for name in (FILE, dycheck.TRAIN)) and (folder / "camera").is_dir()
 
 
 def read(folder: Path, split: str, options: ReadOptions) -> Dataset:
-    """Read one split: the ids listed in ``dataset.json``, each with its camera and image.
+    """Read one split: the ids listed in ``dataset.json`` or, for DyCheck, in ``splits``, each with its camera and
+    image.
 
     ``test`` and ``val`` are ``val_ids``, which are never trained on; if that list is empty, every eighth id is held
     out. Times are ``time_id``, scaled to [0, 1] over all listed frames. The camera of a frame is ``camera_id``.
@@ -57,18 +76,20 @@ def read(folder: Path, split: str, options: ReadOptions) -> Dataset:
     Raises:
         UserError: the data is invalid; one line names the file, the field and the remedy.
     """
-    lists = _lists(folder / FILE)
-    everything = list(dict.fromkeys([*lists["ids"], *lists["train_ids"], *lists["val_ids"]]))
-    times, cameras = _times(folder / "metadata.json", everything)
+    listing = _listing(folder)
     world = _world(folder / "scene.json")
     images, ratio = _images(folder / "rgb", options.downscale)
-    files = [_image(images, name) for name in everything]
-    choice = choose(folder / FILE, files, [times[name] for name in everything], options, cameras)
-    chosen = {everything[index]: index for index in choice.indices}
+    files = [_image(images, name) for name in listing.names]
+    choice = choose(listing.path, files, listing.times, options, listing.cameras)
+    chosen = {listing.names[index]: index for index in choice.indices}
+    by_lidar = dycheck.recognises(folder)
     records = []
-    for name in _of_split(folder / FILE, lists, list(chosen), split, bool(options.only_cameras)):
+    for name in _of_split(listing, list(chosen), split, bool(options.only_cameras)):
         path = folder / "camera" / f"{name}.json"
-        content = read_json(path, "each listed id needs its camera; restore it or drop the id from dataset.json")
+        content = read_json(
+            path, f"each listed id needs its camera; restore it or drop the id from {listing.path.name}"
+        )
+        depth = dycheck.scaled_file(folder / "depth", ratio, f"{name}.npy") if by_lidar else None
         records.append(
             FrameRecord(
                 files[chosen[name]],
@@ -76,12 +97,48 @@ def read(folder: Path, split: str, options: ReadOptions) -> Dataset:
                 choice.times[chosen[name]],
                 partial(_lens, path, content, ratio),
                 name,
+                depth=None if depth is None else DepthFile(depth, world.scale),
+                masked_by_alpha=by_lidar,
+                covisible=None if split == "train" else dycheck.covisible_mask(folder, ratio, name),
             )
         )
     reduced = options._replace(downscale=max(1.0, options.downscale / ratio))
-    data = assemble(records, reduced, folder=folder, split=split, notes=choice.notes)
+    notes = dycheck.notes_of_maps(folder, split, [r.depth for r in records], [r.covisible for r in records])
+    data = assemble(records, reduced, folder=folder, split=split, notes=(*choice.notes, *notes))
     data.bounds = world.bounds
-    return with_points(data, _points(folder / "points.npy", world), None)
+    points = dycheck.lidar_points(folder, data)
+    return with_points(data, *(points or (_points(folder / "points.npy", world), None)))
+
+
+def _listing(folder: Path) -> Listing:
+    """Read which frames there are, and their times and cameras."""
+    splits = dycheck.read_splits(folder)
+    if splits is None:
+        path, lists, times, cameras = folder / FILE, _lists(folder / FILE), {}, {}
+    else:
+        path, times, cameras = folder / dycheck.TRAIN, splits.times, splits.cameras
+        lists = {"ids": [], "train_ids": splits.train, "val_ids": splits.val}
+        _check_names(path, "frame_names", [*splits.train, *splits.val])
+    names = list(dict.fromkeys(name for each in lists.values() for name in each))
+    if not names:
+        raise UserError(f"{path}: lists no frame; name the frames there")
+    if times and cameras:
+        return Listing(
+            path,
+            names,
+            lists["train_ids"],
+            lists["val_ids"],
+            _scaled([times[name] for name in names]),
+            [cameras[name] for name in names],
+        )
+    return Listing(path, names, lists["train_ids"], lists["val_ids"], *_times(folder / "metadata.json", names))
+
+
+def _check_names(path: Path, key: str, names: list[str]) -> None:
+    """Refuse names that are none of files."""
+    for item in names:
+        if not re.fullmatch(r"[\w.+=@, -]{1,200}", item) or item.strip() != item or item[0] == ".":
+            raise UserError(f"{path}: {key} holds {item[:40]!r}, which names no file; correct the id")
 
 
 def _lists(path: Path) -> dict[str, list[str]]:
@@ -93,29 +150,27 @@ def _lists(path: Path) -> dict[str, list[str]]:
         if not isinstance(values, list) or not all(isinstance(item, (str, int)) for item in values):
             raise UserError(f"{path}: {key} is not a list of names; list the frames there")
         lists[key] = list(dict.fromkeys(str(item) for item in values))
-        for item in lists[key]:
-            if not re.fullmatch(r"[\w.+=@, -]{1,200}", item) or item.strip() != item or item[0] == ".":
-                raise UserError(f"{path}: {key} holds {item[:40]!r}, which names no file; correct the id")
+        _check_names(path, key, lists[key])
     if not any(lists.values()):
         raise UserError(f"{path}: ids, train_ids and val_ids are missing or empty; list the frames there")
     return lists
 
 
-def _of_split(
-    path: Path, lists: dict[str, list[str]], chosen: list[str], split: str, chosen_cameras: bool
-) -> list[str]:
+def _of_split(listing: Listing, chosen: list[str], split: str, chosen_cameras: bool) -> list[str]:
     """Return those of the ``chosen`` ids that belong to this split."""
     known = set(chosen)
-    held = [item for item in lists["val_ids"] if item in known]
-    pool = [item for item in lists["train_ids"] if item in known] or chosen
+    held = [item for item in listing.held if item in known]
+    pool = [item for item in listing.train if item in known] or chosen
     outside = set(held)
     rest = [item for item in pool if item not in outside]
     if not held or (not rest and chosen_cameras):  # of one camera of a rig, all frames may be held out
-        return [pool[index] for index in held_out(path, range(len(pool)), split)]
+        return [pool[index] for index in held_out(listing.path, range(len(pool)), split)]
     if split != "train":
         return held
     if not rest:
-        raise UserError(f"{path}: train_ids are all among val_ids, nothing is left to train on; correct the lists")
+        raise UserError(
+            f"{listing.path}: train_ids are all among val_ids, nothing is left to train on; correct the lists"
+        )
     return rest
 
 
@@ -125,26 +180,29 @@ def _image(folder: Path, name: str) -> Path:
     return next((file for file in candidates if file.is_file()), candidates[0])
 
 
-def _times(path: Path, names: list[str]) -> tuple[dict[str, float], list[str]]:
+def _times(path: Path, names: list[str]) -> tuple[list[float], list[str]]:
     """Return times in [0, 1] and the names of the cameras from the metadata of all frames; without metadata, times are
     evenly spaced in the listed order, and the cameras have no names."""
     if not path.is_file():
-        return {name: index / max(len(names) - 1, 1) for index, name in enumerate(names)}, [""] * len(names)
+        return [index / max(len(names) - 1, 1) for index in range(len(names))], [""] * len(names)
     content = read_json(path)
-    values: dict[str, float] = {}
-    cameras = []
+    values, cameras = [], []
     for name in names:
         entry = content.get(name)
         key = "time_id" if isinstance(entry, dict) and "time_id" in entry else "warp_id"
         value = as_number(entry.get(key)) if isinstance(entry, dict) else None
         if value is None:
             raise UserError(f"{path}: {name}.{key} is missing or not a number; give each frame its instant")
-        values[name] = value
+        values.append(value)
         camera = as_number(entry.get("camera_id")) if isinstance(entry, dict) else None
         cameras.append("" if camera is None else f"{camera:g}")
-    first, last = min(values.values()), max(values.values())
-    scaled = {name: (value - first) / (last - first) if last > first else 0.0 for name, value in values.items()}
-    return scaled, cameras
+    return _scaled(values), cameras
+
+
+def _scaled(values: list[float]) -> list[float]:
+    """Scale times to go from 0 to 1."""
+    first, last = min(values), max(values)
+    return [(value - first) / (last - first) if last > first else 0.0 for value in values]
 
 
 def _world(path: Path) -> World:
