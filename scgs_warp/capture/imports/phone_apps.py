@@ -7,7 +7,8 @@ Polycam (raw data): ``keyframes/corrected_images/TIME.jpg`` with ``keyframes/cor
 Record3D (EXR + RGB sequence, ``EXR_RGBD``): ``metadata.json`` with ``poses`` (quaternion x y z w, then position,
 camera-to-world), ``K`` (nine numbers by columns) or ``perFrameIntrinsicCoeffs`` (fx, fy, cx, cy), ``w, h`` and
 ``frameTimestamps``; ``rgb/0.jpg`` and so on; ``depth/0.exr`` in metres. An unpacked .r3d has ``metadata`` and
-``rgbd/0.jpg``; its depth (``rgbd/0.depth``, LZFSE) is not read.
+``rgbd/0.jpg``, with ``rgbd/0.depth``, float32 in metres, and ``rgbd/0.conf``, uint8, both of ``dh`` rows of ``dw``
+numbers, compressed by LZFSE.
 
 3D Scanner App (all data): ``frame_00000.json`` with ``cameraPoseARFrame`` (16 numbers by rows, camera-to-world),
 ``intrinsics`` (nine by rows) and ``time``, beside ``frame_00000.jpg``; ``depth_00000.png`` in millimetres, and
@@ -33,12 +34,16 @@ from ...data.natural_order import natural
 from ...errors import UserError
 from ...storage.exr_files import INSTALL, read_exr, reads_exr
 from ...storage.json_files import as_number, read_json
+from ...storage.lzfse_files import INSTALL as INSTALL_LZFSE
+from ...storage.lzfse_files import read_lzfse, reads_lzfse
 from ..folder_content import is_shown
 from .monst3r import quaternion_matrix
 from .scene import ImportedFrame, ImportedScene, from_arkit, intrinsics, rigid
 
 MILLIMETRE = 0.001
 MAX_DEPTH_PIXELS = 1 << 24
+R3D_SHAPES = ((256, 192), (960, 720))
+"""Rows and columns of depth in an .r3d that does not state them: by LiDAR, and by the camera that sees faces."""
 IMAGE_SUFFIXES = (".jpg", ".jpeg", ".png")
 Reader = Callable[[Path], ImportedScene]
 
@@ -127,13 +132,37 @@ def read_record3d(path: Path) -> ImportedScene:
         pose[:3, :3], pose[:3, 3] = quaternion_matrix(row[[3, 0, 1, 2]], where), row[4:]
         lens = _fitted(file, intrinsics(K, f"{file}: intrinsics of frame {index}"), stated, image)
         depth = maps / f"{image.stem}.exr"
-        load = partial(read_exr, depth) if readable and depth.is_file() else None
+        load = partial(read_exr, depth) if readable and depth.is_file() else _depth_of_r3d(file, content, image)
         frames.append(ImportedFrame(image, from_arkit(rigid(pose, where)), lens, float(moments[index]), load))
     missing = len(poses) - len(frames)
     notes = [f"{missing} of {len(poses)} poses have no image in {folder.name}, and are left out"] if missing else []
     if not readable and any(maps.glob("*.exr")):
         notes.append(f"depth was not read: {INSTALL}")
+    if not reads_lzfse() and any(folder.glob("*.depth")):
+        notes.append(f"depth was not read: {INSTALL_LZFSE}")
     return ImportedScene("Record3D", frames, gravity=True, note="; ".join(notes) or None)
+
+
+def _depth_of_r3d(file: Path, content: dict[str, Any], image: Path) -> Callable[[], np.ndarray] | None:
+    """Return a function that reads the depth beside the image of an unpacked .r3d, 0 where it is least sure; None
+    without it."""
+    depth, sureness = image.with_suffix(".depth"), image.with_suffix(".conf")
+    if not depth.is_file() or not reads_lzfse():
+        return None
+    shapes = R3D_SHAPES
+    if "dw" in content or "dh" in content:
+        rows, columns = (_number(file, content, key) for key in ("dh", "dw"))
+        if not 1 <= min(rows, columns) or rows * columns > MAX_DEPTH_PIXELS:
+            raise UserError(f"{file}: dw and dh are {columns:g} and {rows:g}; export the capture again")
+        shapes = ((int(rows), int(columns)),)
+
+    def load() -> np.ndarray:
+        values = read_lzfse(depth, "<f4", shapes).astype(np.float64)
+        if not sureness.is_file() or not sureness.stat().st_size:
+            return values
+        return np.where(read_lzfse(sureness, "u1", (values.shape,)) > 0, values, 0.0)
+
+    return load
 
 
 def _paired(file: Path, folder: Path, count: int) -> list[Path | None]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 from contextlib import contextmanager
 from pathlib import Path
 from types import SimpleNamespace
@@ -12,6 +13,7 @@ import numpy as np
 import pytest
 import torch
 
+from helpers.data_faults import change
 from helpers.foreign_scenes import (
     COUNT,
     WALL,
@@ -363,6 +365,67 @@ def test_an_unpacked_r3d(tmp_path):
     (record / "rgb").rename(record / "rgbd")
     assert import_scene(record, tmp_path / "data", silent).program == "Record3D"
     np.testing.assert_allclose(entries(tmp_path / "data")[2].camera.viewmat.numpy(), wall().viewmats[2], atol=1e-4)
+
+
+def unpacked_r3d(folder: Path, sure: int = 2, **stated: int) -> Path:
+    """An unpacked .r3d with depth, whose left half has the confidence ``sure``."""
+    imagecodecs = pytest.importorskip("imagecodecs")
+    record = write_record3d(folder)
+    (record / "metadata.json").rename(record / "metadata")
+    (record / "rgb").rename(record / "rgbd")
+    shutil.rmtree(record / "depth", ignore_errors=True)
+    change(record / "metadata", lambda content: content.update(stated))
+    for index, depth in enumerate(wall().depths):
+        levels = np.where(np.arange(depth.shape[1]) < depth.shape[1] // 2, sure, 2) * np.ones_like(depth)
+        for suffix, values in (("depth", depth.astype("<f4")), ("conf", levels.astype(np.uint8))):
+            (record / f"rgbd/{index}.{suffix}").write_bytes(imagecodecs.lzfse_encode(values.tobytes()))
+    return record
+
+
+def test_the_depth_of_an_unpacked_r3d(tmp_path):
+    rows, columns = wall().depths[0].shape
+    made = import_scene(unpacked_r3d(tmp_path / "r", dw=columns, dh=rows), tmp_path / "data", silent)
+    data = load(tmp_path / "data")
+    assert made.note is None and made.points > 100 and len(data.with_depth) == len(data)
+    depth = data.depth(0)
+    assert depth is not None and depth.shape == (rows, columns)
+    index = int(data.entries[0].name.split("_")[1])
+    np.testing.assert_allclose(depth, wall().depths[index], rtol=2e-3)
+
+
+def test_depth_of_an_r3d_that_is_not_sure_is_unknown(tmp_path):
+    rows, columns = wall().depths[0].shape
+    record = unpacked_r3d(tmp_path / "r", 0, dw=columns, dh=rows)
+    loads = [frame.depth for frame in phone_apps.read_record3d(record).frames]
+    assert all(load is not None and not load()[:, : columns // 2].any() and load().any() for load in loads)
+    (record / "rgbd/1.conf").write_bytes(b"")
+    assert loads[1] is not None and loads[1]()[:, : columns // 2].any(), "the camera for faces has no confidence"
+
+
+def test_damaged_depth_of_an_r3d_is_told_in_one_line(tmp_path):
+    rows, columns = wall().depths[0].shape
+    record = unpacked_r3d(tmp_path / "r", dw=columns, dh=rows)
+    depth = record / "rgbd/1.depth"
+    whole = depth.read_bytes()
+    depth.write_bytes(whole[:-20])
+    refused(record, tmp_path, "1.depth: does not decode as LZFSE; export the capture again")
+    depth.write_bytes(whole)
+    change(record / "metadata", lambda content: content.update(dh=rows - 1))
+    refused(record, tmp_path, f"not {columns} x {rows - 1} pixels")
+    change(record / "metadata", lambda content: content.update(dh=1e9))
+    refused(record, tmp_path, "dw and dh are")
+    change(record / "metadata", lambda content: [content.pop(key) for key in ("dw", "dh")])
+    refused(record, tmp_path, "not 192 x 256 or 720 x 960 pixels")
+
+
+def test_without_imagecodecs_the_cameras_of_an_r3d_are_imported(tmp_path, monkeypatch):
+    record = write_record3d(tmp_path / "r")
+    (record / "metadata.json").rename(record / "metadata")
+    (record / "rgb").rename(record / "rgbd")
+    (record / "rgbd/0.depth").touch()
+    monkeypatch.setattr(phone_apps, "reads_lzfse", lambda: False)
+    made = import_scene(record, tmp_path / "data", silent)
+    assert made.frames == COUNT and made.note is not None and "scgs-warp[r3d]" in made.note
 
 
 def test_depth_near_zero_gives_no_points(tmp_path):
