@@ -283,12 +283,14 @@ def main(args: list[str] | None) -> None:
         camera = film_camera(session, 0.0)
         print(f"{options.output}: {frames} frames of {camera.width} x {camera.height}")
     if options.export is not None:
+        from scgs_warp.edit.filming import beyond_end
         from scgs_warp.export.run import write_edited
 
         last = max((frame.at for frame in session.edit.keyframes), default=0.0)
         at = last if options.at is None else options.at
         which = ", the last keyframe" if options.at is None and session.edit.keyframes else ""
         held, note = write_edited(options.export, session, session.scene_time(at), at)
+        which += beyond_end(session, at)
         print(f"{options.export}: {held:,} Gaussians, {at:g} s into the film{which}{note}")
 
 

@@ -23,6 +23,12 @@ from .session import EditSession
 FIELDS = ("azimuth", "elevation", "distance")
 
 
+def beyond_end(session: EditSession, at: float) -> str:
+    """Return words for a moment in seconds after the film's end, at which the scene goes on; empty before it."""
+    end = session.edit.film.seconds
+    return f", after its end at {end:g} s" if at > end else ""
+
+
 def film_camera(session: EditSession, at: float, size: int | None = None) -> Camera:
     """Return the film's camera at a moment in seconds, on the CPU."""
     overview, azimuth, elevation = film_view(session, at)

@@ -14,7 +14,7 @@ import torch
 from .. import data
 from ..config.fields import IMAGE_SETTINGS
 from ..edit import EditSession, edit_file
-from ..edit.filming import note_what_is_late
+from ..edit.filming import beyond_end, note_what_is_late
 from ..edit.skeleton import Skeleton as Parts
 from ..errors import UserError
 from ..formats.gaussian_files import read_antialiased, read_gaussians, shortage_as_user_error, write_gaussians
@@ -122,7 +122,8 @@ def _export_still(request: ExportRequest, device: str) -> str:
         scene = plain_scene(scene if session is None else session.scene)
         if session is not None:
             session, at = session.drawn_with(scene), request.at or 0.0
-            gaussians, when = session.gaussians_at(session.scene_time(at), at), f"{at:g} s into the edit's film"
+            gaussians = session.gaussians_at(session.scene_time(at), at)
+            when = f"{at:g} s into the edit's film{beyond_end(session, at)}"
         elif request.time is not None:
             gaussians, when = scene.gaussians_at(request.time), f"at time {request.time:g}"
         else:

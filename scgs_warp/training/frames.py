@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import cache
 from typing import NamedTuple
 
@@ -107,6 +108,8 @@ class Frames:
         self._parts: dict[tuple[int, bool], Parts] = {}
         self._order: tuple[tuple[int, int], list[int]] = ((-1, 0), [])
         self.by_time = sorted(range(len(self.data)), key=lambda i: data.entries[i].time)
+        self.interrupted: Callable[[], bool] = lambda: False
+        """Asked between the views of a step, which ends without effect if it is True (``multi_view``)."""
 
     def __len__(self) -> int:
         return len(self.data)

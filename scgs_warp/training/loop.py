@@ -24,7 +24,7 @@ from ..scene.scene import Scene
 from ..storage import checkpoint
 from .density_control import Steps, control_density, density_due, take_step
 from .frames import Frames
-from .multi_view import check_replicas, check_share
+from .multi_view import StepInterrupted, check_replicas, check_share
 from .preflight import refuse_empty_chunks
 from .process_group import ProcessGroup, ProcessLost
 from .recorded_step import RecordedSteps
@@ -112,7 +112,7 @@ def fit(
 
         # 3. Train.
         with progress(config.steps, "training", start=state.step) as bar, stop_signals() as stop:
-            folder.tell = bar.print
+            folder.tell, frames.interrupted = bar.print, stop.is_set
             try:
                 check_replicas(state)
                 _train(state, frames, folder, test, bar, stop, watcher)
@@ -272,6 +272,8 @@ def _perhaps_again(
         note = try_again(state, frames, partial(steps_of, tell=bar.print), go_on)
     except ProcessLost:
         raise
+    except StepInterrupted:
+        _stop(state, bar)
     except UserError as error:
         raise _saved(state, error) from error
     bar.advance(0, second=None)
@@ -322,6 +324,10 @@ def _take(
         _finish(state, steps, folder, bar, results)
         state.save(folder.path)
         raise
+    except StepInterrupted:
+        _finish(state, steps, folder, bar, results)
+        state.save(folder.path)
+        _stop(state, bar)
     except FrameError as error:
         _finish(state, steps, folder, bar, results)
         state.save(folder.path)

@@ -24,6 +24,10 @@ TERMS = ("image loss", "regulariser")
 DIFFER = "the processes no longer hold the same scene; are the data, the packages and the kind of processor the same?"
 
 
+class StepInterrupted(Exception):
+    """The user wants to stop, and not wait for the other views of the step."""
+
+
 def all_views(
     state: TrainState, frames: Frames, one_view: Callable[[TrainState, Frames, int, Stats], StepResult]
 ) -> StepResult:
@@ -41,6 +45,7 @@ def all_views(
     Raises:
         UserError: the processes are not at the same step.
         ProcessLost: another process has ended or hangs.
+        StepInterrupted: ``frames.interrupted`` was True between two views of a single process; nothing has changed.
     """
     group, batch = state.group, state.config.batch
     size, rank = (1, 0) if group is None else (group.size, group.rank)
@@ -52,6 +57,9 @@ def all_views(
         if group is not None:  # each round reduces the gradients of one view per process
             _drop_gradients(state)
             stats = _empty(state)
+        elif first and frames.interrupted():
+            _drop_gradients(state)
+            raise StepInterrupted
         result = one_view(state, frames, first + rank, stats)
         shown = shown or result
         added = [] if result.failed else [*_gradients(state), stats.grad_norm, stats.count]

@@ -45,6 +45,8 @@ def test_the_app_films_and_exports(tmp_path, ply, capsys):
         assert "300 Gaussians, 0.5 s into the film" in capsys.readouterr().out
         found = read_gaussians(tmp_path / name).means
         assert float(torch.cdist(read_gaussian_ply(export).means, found).min(dim=1).values.max()) < 0.01
+    assert app.cli([*arguments[:-2], "--export", export, "--at", "99"]) == 0
+    assert f"99 s into the film, after its end at {SCRIPT['film']['seconds']:g} s" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("name", ["out.ply", "out.glb", "out.compressed.ply", "out.splat", "out.spz", "out.sog"])

@@ -18,7 +18,7 @@ from scgs_warp.evaluation.evaluate import evaluate
 from scgs_warp.evaluation.image_metrics import psnr
 from scgs_warp.scene.scene import Scene
 from scgs_warp.storage import checkpoint
-from scgs_warp.training import loop
+from scgs_warp.training import loop, step
 from scgs_warp.training.frames import Frames
 from scgs_warp.training.gaussian_density import RESET_OPACITY
 from scgs_warp.training.loop import fit
@@ -117,6 +117,25 @@ def test_a_run_that_is_stopped_by_sigterm_resumes_to_the_same_bits(tmp_path, mon
     monkeypatch.undo()
     fit(tiny_config(60), data, output=tmp_path / "run", resume=True)
     fit(tiny_config(60), data, output=tmp_path / "whole")
+    assert checkpoint_bytes(tmp_path / "run") == checkpoint_bytes(tmp_path / "whole")
+
+
+def test_a_stop_does_not_wait_for_the_other_views_of_a_step(tmp_path, monkeypatch):
+    data, view_of, seen = tiny_dataset(6), step.one_view, []
+
+    def interrupting(state, frames, view, stats):
+        seen.append((state.step, view))
+        if seen[-1] == (20, 2):
+            os.kill(os.getpid(), signal.SIGTERM)
+        return view_of(state, frames, view, stats)
+
+    monkeypatch.setattr(step, "one_view", interrupting)
+    with pytest.raises(KeyboardInterrupt):
+        fit(tiny_config(30, batch=5), data, output=tmp_path / "run")
+    monkeypatch.undo()
+    assert seen[-1] == (20, 2) and Scene.load(tmp_path / "run").step == 20
+    fit(tiny_config(30, batch=5), data, output=tmp_path / "run", resume=True)
+    fit(tiny_config(30, batch=5), data, output=tmp_path / "whole")
     assert checkpoint_bytes(tmp_path / "run") == checkpoint_bytes(tmp_path / "whole")
 
 
