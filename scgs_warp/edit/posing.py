@@ -9,12 +9,13 @@ from pathlib import Path
 
 import numpy as np
 
+from ..config.bounds import MOST_NODES
 from ..errors import UserError
 from ..types import Gaussians
 from . import edit_file, skeleton_file
 from .document import Edit
 from .engine import Engine
-from .field_reader import FieldReader, point_of
+from .field_reader import FieldReader, plain_values, point_of
 from .graph import chosen_nodes
 from .handles import STAY, Handle, Target
 from .part_pose import JointFrame, PartMove, Rigid
@@ -70,9 +71,13 @@ class Posing:
         Args:
             count: number of parts; None: the parts of the edit's skeleton, or else of the run's, whose number follows
                 from the motion.
+
+        Raises:
+            UserError: the count is no whole number above 0.
         """
         if count is None:
             return self.skeleton.parts
+        FieldReader(plain_values({"count": count}), "parts").integer("count", 1, 1, MOST_NODES)
         if count not in self._found:
             self._found[count] = self._find(count)
         return self._found[count].parts

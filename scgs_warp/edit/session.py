@@ -20,6 +20,7 @@ from ..rendering.render import render
 from ..scene.arguments import given_camera, given_color
 from ..scene.scene import Scene
 from ..storage.files import write_atomically
+from ..storage.output_folders import make_parent
 from ..types import Camera, Gaussians, Image
 from . import edit_file
 from .document import Edit
@@ -373,12 +374,13 @@ class EditSession(Posing):
     # Files
 
     def save(self, path: str | Path) -> None:
-        """Write the edit as JSON that loads as the same edit. Saving does not end a drag.
+        """Write the edit as JSON that loads as the same edit; missing folders are made. Saving does not end a drag.
 
         Raises:
             UserError: the file cannot be written, or the edit has a field that no file may hold.
         """
         edit_file.checked(self.edit, self.engine)
+        make_parent(Path(path))
         write_atomically(Path(path), edit_file.to_json(self.edit, self.engine).encode())
 
     def load(self, path: str | Path) -> None:

@@ -25,7 +25,7 @@ def unwritten(size: int, device: torch.device | str = "cpu") -> Tensor:
 
 def unwritten_slots(pairs: int, width: int, device: torch.device) -> Tensor:
     """Allocate [pairs, width] float32 for a kernel to fill, as :func:`unwritten` does."""
-    slots = torch.empty(pairs, width, device=device)
+    slots = torch.empty(pairs, width, dtype=torch.float32, device=device)
     if debug.enabled():
         slots.view(torch.int32).fill_(UNWRITTEN_BITS)
     return slots

@@ -323,9 +323,9 @@ def _adjoint(
 def _background_gradient(v_image: Tensor, transmittance: Tensor) -> Tensor:
     """Return the background's gradient: the sum over pixels of v_image times transmittance, [C], in fixed order."""
     channels, height, _ = v_image.shape
-    rows = torch.empty(height, channels, device=v_image.device)
+    rows = v_image.new_empty(height, channels)
     launch(kernels.background_rows, height, v_image, transmittance, rows, grain=16)
-    total = torch.empty(channels, device=v_image.device)
+    total = v_image.new_empty(channels)
     launch(kernels.sum_rows, channels, rows, total)
     return total
 

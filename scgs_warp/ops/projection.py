@@ -63,7 +63,7 @@ class _Project(torch.autograd.Function):
         v_opacities = means.new_zeros(count) if v_opacities is None else v_opacities.contiguous()
         v_depths = None if v_depths is None else v_depths.contiguous()
         v_inputs = tuple(torch.empty_like(x) for x in (means, quats, scales, opacities))
-        v_views = torch.empty(count, 4, 3, device=means.device) if wants_view else None
+        v_views = means.new_empty(count, 4, 3) if wants_view else None
         inputs = means, quats, scales, opacities, viewmat[None], K[None]
         camera = settings.width, settings.height, settings.eps2d, settings.antialiased
         incoming = v_means2d, v_conics, v_depths, v_opacities

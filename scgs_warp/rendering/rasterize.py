@@ -11,12 +11,24 @@ from ..ops.binning import bin_splats
 from ..ops.compositing import composite, demand
 from ..ops.harmonics import MAX_DEGREE, whole_harmonics
 from ..ops.projection import project
+from ..runtime.caller_settings import unaffected
 from ..types import Camera, Splats
 from .render import centre_of, expected_depth
 
 RENDER_MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
 
 
+class Meta(dict[str, Any]):
+    """Intermediate results by name."""
+
+    def __missing__(self, name: str) -> Any:
+        raise KeyError(
+            f"{name}: not in meta, which holds {', '.join(self)} for all N Gaussians, as with packed=False; give "
+            "packed=False to what reads it"
+        )
+
+
+@unaffected
 def rasterization(
     means: Tensor,
     quats: Tensor,
@@ -76,7 +88,7 @@ def rasterization(
             gradients of the 2D means (AbsGS).
         rasterize_mode: ``antialiased``: Mip-Splatting's opacity compensation.
         packed: no effect, like ``tile_size``, ``sparse_grad``, ``channel_chunk`` and ``segmented``, because there is
-            only one memory layout.
+            only one memory layout, that of ``packed=False``.
 
     Returns:
         renders [C, H, W, D], alphas [C, H, W, 1], and meta: ``means2d`` [C, N, 2] (may ``retain_grad``), ``radii``
@@ -106,7 +118,7 @@ def rasterization(
     if rasterize_mode not in ("classic", "antialiased"):
         raise ValueError(f"rasterize_mode must be classic or antialiased, got {rasterize_mode!r}")
     floats = {"means": means, "quats": quats, "scales": scales, "opacities": opacities, "colors": colors}
-    _check_dtypes(**floats, viewmats=viewmats, Ks=Ks, backgrounds=backgrounds)
+    _check_dtypes(**floats, viewmats=viewmats, Ks=Ks, **({} if backgrounds is None else {"backgrounds": backgrounds}))
     _check_shapes(means, colors, viewmats, Ks, backgrounds, sh_degree)
     cameras = [Camera(viewmat, K, width, height) for viewmat, K in zip(viewmats, Ks)]
     settings = {
@@ -165,11 +177,9 @@ def _stacked(of_cameras: list[Tensor]) -> Tensor:
     return of_cameras[0][None] if len(of_cameras) == 1 else torch.stack(of_cameras)
 
 
-def _meta(splats: list[Splats], absgrad: bool) -> dict[str, Any]:
-    meta: dict[str, Any] = {
-        name: _stacked([getattr(splat, name) for splat in splats])
-        for name in ("means2d", "radii", "depths", "conics", "opacities")
-    }
+def _meta(splats: list[Splats], absgrad: bool) -> Meta:
+    names = "means2d", "radii", "depths", "conics", "opacities"
+    meta = Meta((name, _stacked([getattr(splat, name) for splat in splats])) for name in names)
     meta.update(width=splats[0].width, height=splats[0].height, n_cameras=len(splats))
     if absgrad:
         meta["means2d"].absgrad = torch.zeros_like(meta["means2d"])
@@ -186,11 +196,11 @@ def _refuse(**unsupported: bool) -> None:
             raise NotImplementedError(f"{name}: scgs_warp does not do this; see scgs_warp.rasterization")
 
 
-def _check_dtypes(**tensors: Tensor | None) -> None:
+def _check_dtypes(**tensors: Tensor) -> None:
     for name, tensor in tensors.items():
-        if tensor is not None and not isinstance(tensor, Tensor):
+        if not isinstance(tensor, Tensor):
             raise ValueError(f"{name} must be a torch tensor, got {type(tensor).__name__}; use torch.as_tensor")
-        if tensor is not None and tensor.dtype != torch.float32:
+        if tensor.dtype != torch.float32:
             raise ValueError(f"{name} must be float32, got {tensor.dtype}")
 
 
@@ -198,7 +208,9 @@ def _check_shapes(
     means: Tensor, colors: Tensor, viewmats: Tensor, Ks: Tensor, backgrounds: Tensor | None, sh_degree: int | None
 ) -> None:
     """Check the shapes that ``project`` does not check."""
-    count = len(means) if means.ndim else 0
+    if means.ndim != 2:
+        raise ValueError(f"means must be [N, 3], got {tuple(means.shape)}; call once for each scene of a batch")
+    count = len(means)
     if viewmats.ndim != 3 or tuple(viewmats.shape[1:]) != (4, 4) or len(viewmats) == 0:
         raise ValueError(f"viewmats must be [C, 4, 4] with C > 0, got {tuple(viewmats.shape)}")
     cameras = len(viewmats)

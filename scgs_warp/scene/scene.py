@@ -24,6 +24,7 @@ from ..motion.base import Motion
 from ..motion.control_points import ControlPoints
 from ..motion.spheres import Spheres
 from ..rendering.render import render
+from ..runtime.caller_settings import unaffected
 from ..runtime.environment import check_device
 from ..storage import checkpoint
 from ..storage.files import read_text
@@ -72,6 +73,7 @@ class Scene:
         self._frames: FrameGraph | None = None
 
     @staticmethod
+    @unaffected
     def load(run: str | Path, device: str = "cpu") -> Scene:
         """Load the scene of a run folder written by :func:`scgs_warp.fit` or ``apps/train.py``.
 
@@ -94,7 +96,7 @@ class Scene:
             raise UserError(f"{folder}: no such run folder; apps/train.py --output makes one")
         tensors, metadata = checkpoint.read(folder, ("gaussians.", "motion."))
         scene = scene_from(tensors, metadata, device, str(folder / checkpoint.FILE))
-        scene.folder = folder
+        scene.folder = folder.absolute()  # also after the program has changed its directory
         settings_path = folder / "config.json"
         if settings_path.exists():
             try:
@@ -112,12 +114,17 @@ class Scene:
         check_motion(scene, str(folder / checkpoint.FILE), scene.config.motion.chunks)
         return scene
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Leave out the renderer of frames, which copies make anew."""
+        return {**self.__dict__, "_frames": None}
+
     def freeze_binding(self) -> None:
         """Compute every Gaussian's control points once, since they do not depend on time."""
         cache = getattr(self.motion, "cache_binding", None)
         if cache is not None:
             cache(self.gaussians)
 
+    @unaffected
     def prepare_playback(
         self, tolerance: float = 3e-4, tell: Callable[[int, int], None] = lambda done, total: None
     ) -> bool:
@@ -170,6 +177,7 @@ class Scene:
         """Background of the training images; black if it was random."""
         return BACKGROUND_COLORS[self.config.data.background]
 
+    @unaffected
     @torch.no_grad()
     def gaussians_at(self, time: float) -> Gaussians:
         """Return the posed, activated Gaussians at one time, in the form that other renderers take.
@@ -197,6 +205,7 @@ class Scene:
             posed.sharpness,
         ).plain()
 
+    @unaffected
     @torch.no_grad()
     def render(
         self, camera: Camera, time: float, background: tuple[float, float, float] | Tensor | None = None
@@ -262,6 +271,7 @@ class Scene:
             )
         return frames
 
+    @unaffected
     @torch.no_grad()
     def control_points_at(self, time: float) -> Tensor:
         """Return the control points [M, 3] at ``time``, clamped to [0, 1], in world units; [0, 3] for motion models

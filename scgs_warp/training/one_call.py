@@ -78,7 +78,7 @@ def _trained(config: TrainConfig, data: str | Path | Dataset | None, folder: Pat
     if isinstance(data, Dataset):
         say("\n".join(advise(survey(data), config, device)))
         scene = fit(config, data, output=folder, device=device, resume=resume)
-        scene.folder = folder
+        scene.folder = folder.absolute()
         return scene
     if data is None:
         make_synthetic(BUILTIN, device=device)
@@ -87,7 +87,7 @@ def _trained(config: TrainConfig, data: str | Path | Dataset | None, folder: Pat
     say("\n".join(advise(survey(training), config, device)))
     settings = settings_of(config, source)
     scene = fit(config, training, output=folder, device=device, test=test, resume=resume, settings=settings)
-    scene.folder = folder
+    scene.folder = folder.absolute()
     write_results(scene, test, folder, frames=0)
     return scene
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import operator
 from pathlib import Path
 from typing import Literal
 
@@ -29,6 +30,14 @@ def turntable(
 ) -> Path:
     """Write a film of a scene; see :meth:`Scene.turntable`."""
     target = video.check_path(path)
+    try:
+        frames, size, fps = operator.index(frames), operator.index(size), float(fps)
+        time = None if time is None else float(time)
+    except (TypeError, ValueError):
+        told = f"frames {frames!r}, size {size!r}, fps {fps!r}, time {time!r}"
+        raise UserError(f"{told}: give whole numbers of frames and pixels, and numbers") from None
+    if time is not None and not 0.0 <= time <= 1.0:
+        raise UserError(f"time {time:g}: give a time from 0 to 1")
     if frames < 1 or not 16 <= size <= 8192 or not video.SLOWEST <= fps <= 1000:
         raise UserError(
             f"frames {frames}, size {size}, fps {fps:g}: give at least 1, 16 to 8192, and {video.SLOWEST} to 1000"

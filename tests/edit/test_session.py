@@ -191,7 +191,9 @@ def test_save_and_load_give_the_same_bits(bent, tmp_path):
     bent.add_keyframe(1.5, "ease")
     changed = dataclasses.replace(bent.edit, holds=(Hold((0, 1, 2), 0.25),), exaggerate=Exaggerate(1.25))
     bent.apply(changed)
+    bent.save(tmp_path / "new" / "folder" / "edit.json")
     bent.save(tmp_path / "edit.json")
+    assert (tmp_path / "new/folder/edit.json").read_bytes() == (tmp_path / "edit.json").read_bytes()
     first = bent.render(CAMERA, 0.3, 0.9)
     other = EditSession(bar_scene())
     other.load(tmp_path / "edit.json")
@@ -255,7 +257,8 @@ def test_mistakes_are_one_line(session):
         (lambda: session.add_handle([1], 0.0, pivot=(math.nan, 0.0, 0.0)), "pivot"),
         (lambda: session.drag("nobody", [1, 0, 0]), "nobody"),
         (lambda: session.add_keyframe(1.0), "handle"),
-        (lambda: session.save("/nowhere/edit.json"), "nowhere"),
+        (lambda: session.save("/dev/null/edit.json"), "/dev/null"),
+        *((lambda count=count: session.parts(count), "parts: count is") for count in (0, -1, 2.5, "3", True)),
     ]:
         with pytest.raises(UserError, match=words) as caught:
             make()

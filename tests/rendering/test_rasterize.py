@@ -10,6 +10,7 @@ import torch
 
 import scgs_warp
 from helpers.scenes import random_camera, random_gaussians
+from helpers.torch_settings import SETTINGS
 from reference.harmonics import spherical_harmonics as harmonics_reference
 from reference.projection import rows_error
 from reference.render import rasterize
@@ -181,7 +182,11 @@ def test_names_order_and_defaults_are_those_of_gsplat():
         {"viewmats": torch.eye(4)},
         {"Ks": torch.eye(3)},
         {"means": torch.zeros(5, 3, dtype=torch.float64)},
+        {"means": torch.zeros(2, 5, 3)},
         {"opacities": torch.zeros(5, 1)},
+        {"means": None},
+        {"colors": None},
+        {"viewmats": None},
         {"sh_degree": 1, "colors": torch.zeros(5, 3, 3)},
     ],
     ids=lambda a: "-".join(a),
@@ -192,6 +197,33 @@ def test_what_is_wrong_or_not_done_is_named(argument):
     arguments = dict(zip(names, (*shape, colors, viewmats, Ks, WIDTH, HEIGHT))) | argument
     with pytest.raises((ValueError, NotImplementedError), match=next(iter(argument))):
         scgs_warp.rasterization(**arguments)
+
+
+@pytest.mark.parametrize("setting", SETTINGS)
+def test_what_the_caller_has_set_for_torch_changes_nothing(setting):
+    def drawn():
+        inputs = leaves_of(*shape, coefficients, viewmats)
+        renders, alphas, meta = scgs_warp.rasterization(
+            *inputs, Ks, WIDTH, HEIGHT, sh_degree=3, render_mode="RGB+ED", absgrad=True
+        )
+        (renders.square().sum() + alphas.sum()).backward()
+        return [renders, alphas, meta["means2d"].absgrad, *(leaf.grad for leaf in inputs)]
+
+    g = random_gaussians(3, 100)
+    shape, _, viewmats, Ks, _ = scene_of(3, 100, "cpu")
+    coefficients = torch.cat([g.sh_dc[:, None], g.sh_rest], 1)
+    plain = drawn()
+    with SETTINGS[setting]():
+        changed = drawn()
+    assert all(torch.equal(a, b) for a, b in zip(plain, changed))
+
+
+def test_meta_says_what_it_does_not_hold():
+    shape, colors, viewmats, Ks, _ = scene_of(4, 6, "cpu")
+    meta = scgs_warp.rasterization(*shape, colors, viewmats, Ks, WIDTH, HEIGHT)[2]
+    assert "gaussian_ids" not in meta and meta.get("gaussian_ids") is None and len(meta) == 8
+    with pytest.raises(KeyError, match=r"gaussian_ids: not in meta, which holds means2d, .* give packed=False"):
+        meta["gaussian_ids"]
 
 
 def test_arrays_of_numpy_are_named():

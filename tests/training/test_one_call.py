@@ -27,7 +27,7 @@ def test_a_folder_becomes_a_scene_and_a_run(tmp_path, monkeypatch, capsys):
     calls: list[tuple[str, int, int]] = []
     write_dnerf(tmp_path / "blobs")
     scene = scgs_warp.train("blobs", progress=lambda *call: calls.append(call), **TINY)
-    assert scene.step == 60 and scene.folder == Path("runs/blobs-cpu") and capsys.readouterr().out == ""
+    assert scene.step == 60 and scene.folder == tmp_path / "runs/blobs-cpu" and capsys.readouterr().out == ""
     assert [call for call in calls if call[0] == "training"] == [("training", step, 60) for step in range(1, 61)]
     metrics = json.loads((scene.folder / "metrics.json").read_text())
     assert metrics["images"] == 3 and metrics["seconds"] > 0 and (scene.folder / "contact_sheet.png").is_file()
@@ -70,3 +70,9 @@ def test_a_film_of_impossible_size(tmp_path):
     for options in ({"frames": 0}, {"size": 5}, {"fps": 0}):
         with pytest.raises(UserError, match="give at least 1"):
             turntable(FakeScene(), tmp_path / "film.mp4", **options)  # type: ignore[arg-type]
+    for options in ({"frames": 1.5}, {"frames": "3"}, {"size": 64.5}, {"fps": "fast"}, {"time": "noon"}):
+        with pytest.raises(UserError, match="give whole numbers of frames and pixels, and numbers"):
+            turntable(FakeScene(), tmp_path / "film.mp4", **options)  # type: ignore[arg-type]
+    for time in (3, -0.1, float("nan")):
+        with pytest.raises(UserError, match="give a time from 0 to 1"):
+            turntable(FakeScene(), tmp_path / "film.mp4", time=time)  # type: ignore[arg-type]

@@ -1,0 +1,54 @@
+"""Independence of the settings that a caller of the library has changed for torch."""
+
+from __future__ import annotations
+
+import contextlib
+import functools
+import sys
+from collections.abc import Callable, Iterator
+from typing import ParamSpec, TypeVar
+
+import torch
+
+Parameters = ParamSpec("Parameters")
+Result = TypeVar("Result")
+
+KINDS = ("cpu", "cuda")
+"""Kinds of devices that may have autocast."""
+
+
+def unaffected(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
+    """Let a function compute as if its caller had changed none of torch's settings: without autocast, with float32 and
+    the CPU as defaults. ``torch.compile`` leaves the function as it is, since it cannot compile kernels, and would
+    trace all that launches them instead."""
+    eager: list[Callable[Parameters, Result]] = []
+
+    @functools.wraps(function)
+    def call(*args: Parameters.args, **kwargs: Parameters.kwargs) -> Result:
+        run = function
+        if "torch._dynamo" in sys.modules:  # importing the compiler takes a second
+            if not eager:
+                eager.append(torch.compiler.disable(function))
+            run = eager[0]
+        if _as_usual():
+            return run(*args, **kwargs)
+        with _usual_settings():
+            return run(*args, **kwargs)
+
+    return call
+
+
+def _as_usual() -> bool:
+    plain = torch.get_default_dtype() is torch.float32 and torch.get_default_device().type == "cpu"
+    return plain and not any(map(torch.is_autocast_enabled, KINDS))
+
+
+@contextlib.contextmanager
+def _usual_settings() -> Iterator[None]:
+    with contextlib.ExitStack() as stack:
+        for kind in filter(torch.is_autocast_enabled, KINDS):
+            stack.enter_context(torch.autocast(kind, enabled=False))
+        stack.enter_context(torch.device("cpu"))
+        stack.callback(torch.set_default_dtype, torch.get_default_dtype())
+        torch.set_default_dtype(torch.float32)
+        yield

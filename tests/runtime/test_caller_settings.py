@@ -1,0 +1,47 @@
+"""Functions that compute as if their caller had not changed torch's settings."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from helpers.torch_settings import SETTINGS, default_dtype
+from scgs_warp.runtime.caller_settings import unaffected
+
+
+@unaffected
+def product() -> torch.Tensor:
+    """Return a product of matrices."""
+    return torch.ones(2, 2) @ torch.ones(2, 2)
+
+
+@pytest.mark.parametrize("setting", SETTINGS)
+def test_settings_of_the_caller_stay_outside(setting):
+    with SETTINGS[setting]():
+        found, theirs = product(), torch.ones(2, 2) @ torch.ones(2, 2)
+    assert found.dtype is torch.float32 and found.device.type == "cpu"
+    assert theirs.dtype is not torch.float32 or theirs.device.type == "meta", "the caller's settings are back"
+    assert product.__doc__ == "Return a product of matrices."
+
+
+def test_an_error_gives_the_settings_back():
+    @unaffected
+    def fails() -> None:
+        raise ValueError("as asked")
+
+    with default_dtype():
+        with pytest.raises(ValueError, match="as asked"):
+            fails()
+        assert torch.get_default_dtype() is torch.float64
+
+
+def test_the_compiler_leaves_it_as_it_is():
+    compiled = []
+
+    @unaffected
+    def doubled(values: torch.Tensor) -> torch.Tensor:
+        compiled.append(torch.compiler.is_compiling())
+        return 2 * values
+
+    found = torch.compile(lambda values: doubled(values) + 1, backend="eager")(torch.ones(3))
+    assert found.tolist() == [3.0, 3.0, 3.0] and compiled == [False]

@@ -1,0 +1,65 @@
+"""Scenes as scripts use them: from another folder, copied, and under settings of torch's that are the script's own."""
+
+from __future__ import annotations
+
+import copy
+import pickle
+
+import pytest
+import torch
+
+from helpers.edit_scenes import bar_scene
+from helpers.export_runs import moving_run
+from helpers.tiny import tiny_camera
+from helpers.torch_settings import SETTINGS
+from scgs_warp.edit import EditSession
+from scgs_warp.scene.scene import Scene
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory):
+    return moving_run(tmp_path_factory.mktemp("scripts") / "run")
+
+
+@pytest.mark.parametrize("name", ["run", "."])
+def test_the_program_changes_its_directory(run, name, tmp_path, monkeypatch):
+    """The parts of the run stay those that its folder keeps, and the page in a notebook has a title."""
+    session = EditSession(Scene.load(run))
+    session.rename_part(session.parts()[0].name, "of this run")
+    session.save_skeleton()
+    monkeypatch.chdir(run.parent if name == "run" else run)
+    scene = Scene.load(name)
+    assert 'title="run"' in (scene._repr_html_() or "")
+    monkeypatch.chdir(tmp_path)
+    assert EditSession(scene).parts()[0].name == "of this run"
+    assert scene.folder == run
+
+
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda scene: pickle.loads(pickle.dumps(scene))])
+def test_copies_draw_the_same(run, copied):
+    scene, camera = Scene.load(run), tiny_camera(0, 4, 24)
+    scene.frame_graph()  # as if a GPU had drawn a frame
+    other = copied(scene)
+    assert torch.equal(other.render(camera, 0.3).rgb, scene.render(camera, 0.3).rgb)
+
+
+@pytest.mark.parametrize("setting", SETTINGS)
+def test_what_a_script_has_set_for_torch_changes_nothing(run, setting):
+    camera = tiny_camera(0, 4, 24)
+    truth = Scene.load(run)
+    with SETTINGS[setting]():
+        scene = Scene.load(run)
+        image, means = scene.render(camera, 0.3), scene.gaussians_at(0.3).means
+        points = scene.control_points_at(0.3)
+    assert torch.equal(image.rgb, truth.render(camera, 0.3).rgb)
+    assert torch.equal(means, truth.gaussians_at(0.3).means)
+    assert torch.equal(points, truth.control_points_at(0.3))
+
+
+def test_an_edited_scene_is_drawn_under_autocast():
+    session = EditSession(bar_scene(nodes=12, gaussians=60))
+    session.add_handle([0, 1], time=0.0, name="end")
+    session.move("end", translation=(0.0, 0.1, 0.0))
+    truth = session.render(tiny_camera(0, 4, 24), 0.3)
+    with SETTINGS["autocast"]():
+        assert torch.equal(session.render(tiny_camera(0, 4, 24), 0.3).rgb, truth.rgb)
