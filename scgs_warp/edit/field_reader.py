@@ -295,7 +295,8 @@ def whole_number(value: Any) -> int | None:
 def show_value(value: Any) -> str:
     """Quote a JSON value in at most 60 characters of one line."""
     try:
-        text = json.dumps(value, default=repr) if value is not None else "missing"
+        text = json.dumps(value, default=repr, ensure_ascii=False) if value is not None else "missing"
+        text = text if text.isprintable() else json.dumps(value, default=repr)
     except RecursionError:
         return "nested too deeply"
     return text if len(text) <= 60 else text[:57] + "..."

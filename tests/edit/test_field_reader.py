@@ -53,4 +53,6 @@ def test_objects_are_strict_json():
 
 def test_what_a_message_quotes_is_short_and_on_one_line():
     assert show_value(None) == "missing" and len(show_value("x" * 1000)) == 60
+    assert show_value(["bras droit é", "右腕"]) == '["bras droit é", "右腕"]', "as it was written"
+    assert show_value("a\u202eb") == '"a\\u202eb"', "what turns the line round is not"
     assert one_line("a\nb") == "a\\nb" and len(one_line("x" * 1000)) == 100

@@ -202,3 +202,30 @@ def test_the_scene_is_drawn_again_when_the_graphics_driver_comes_back(browser, e
     window.still()
     assert view.screenshot() == before
     window.close()
+
+
+@pytest.mark.parametrize("title", ["x" * 150, "run 1.", "a" * 99 + " b", "右腕", "..hidden", "Ångström."])
+def test_copies_are_saved_under_a_name_that_follows_from_any_title(browser, editor, folder, title):
+    window = Window(browser, editor)
+    window.still()
+    window.ask("(studio.title = argument, studio.save())", title)
+    until(window.page.locator("#notes").inner_text)
+    assert "is done" in window.page.locator("#notes").inner_text()
+    names = {path.name for path in folder.glob("[!.]*.json")} - {"autosave.json"}
+    assert len(names) == 1 and len(names.pop()) <= 105
+    window.close()
+
+
+def test_high_contrast_shows_the_tool_and_the_moment(browser, editor):
+    window = Window(browser, editor, forced_colors="active")
+    window.still()
+    window.ask("studio.link.ask('select', { what: 'nodes', nodes: [1, 2], how: 'replace' })")
+    window.ask("studio.link.ask('put', { translation: [0, 0, 0.1] })")
+    window.page.keyboard.press("k")
+    until(lambda: window.page.locator("#tracks .key").count() == 2)
+    pressed, other, head, key, lane = window.page.evaluate(
+        """['[aria-pressed="true"]', '[aria-pressed="false"]', "#head", "#tracks .key", "#tracks .ruler"].map(
+        (place) => getComputedStyle(document.querySelector(place)).backgroundColor)"""
+    )
+    assert pressed != other and lane not in (head, key)
+    window.close()

@@ -54,7 +54,8 @@ class Studio {
   }
 
   get name() {
-    return this.title.replace(/[^A-Za-z0-9 ._-]/g, "-").replace(/^[^A-Za-z0-9]+/, "") || "edit";
+    const plain = this.title.replace(/[^A-Za-z0-9 ._-]/g, "-").replace(/^[^A-Za-z0-9]+/, "");
+    return plain.slice(0, 100).replace(/[. ]+$/, "") || "edit"; // as scgs_warp/editor/files.py takes names
   }
 
   greet(hello) {
