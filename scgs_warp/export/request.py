@@ -175,6 +175,9 @@ def check_request(request: ExportRequest) -> None:
         raise UserError(f"--format {kind}: needs --run; a file of Gaussians has no cameras")
     one_instant = kind in STILL_FORMATS or (kind == "mesh" and not request.sequence)
     if request.run is None and request.edit is None and not one_instant and kind != "html":
+        if request.format is None and not output_suffix(request.output):
+            endings = ", ".join(SUFFIXES[kind] for kind in (*STILL_FORMATS, "html", "mesh"))
+            raise UserError(f"--output {request.output}: has no suffix; end the name in one of {endings}")
         raise UserError(f"--format {kind}: needs --run, or an --edit that moves the Gaussians of {request.ply}")
     if request.time is not None and not 0 <= request.time <= 1:
         raise UserError(f"--time {request.time:g}: give a time from 0 to 1")

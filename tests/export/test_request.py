@@ -44,6 +44,7 @@ def test_a_glb_is_still_where_an_instant_is_given():
     ("name", "fields", "words"),
     [
         ("a.txt", {}, "no format ends in .txt"),
+        ("a", {"run": None, "ply": Path("b.ply")}, "has no suffix; end the name in one of .ply, .compressed.ply"),
         ("a.ply", {"ply": Path("b.ply")}, "one of --run and --ply"),
         ("a.ply", {"time": 1.5}, "--time 1.5"),
         ("a.npz", {"time": 0.5}, "the format holds all times"),
@@ -66,7 +67,7 @@ def test_a_glb_is_still_where_an_instant_is_given():
 )
 def test_options_that_cannot_work_are_refused_in_one_line(tmp_path, name, fields, words):
     with pytest.raises(UserError, match=words) as caught:
-        check_request(ExportRequest(tmp_path / "new" / name, run=tmp_path, **fields))
+        check_request(ExportRequest(tmp_path / "new" / name, **{"run": tmp_path, **fields}))
     assert "\n" not in str(caught.value) and list(tmp_path.iterdir()) == []
 
 
