@@ -17,6 +17,7 @@ from ..data.dataset import Dataset
 from ..data.thumbnails import thumbnails
 from ..errors import FrameError, UserError
 from ..runtime import environment
+from ..runtime.caller_settings import unaffected
 from ..runtime.memory import NotEnoughMemory
 from ..runtime.progress import Progress, clock, progress
 from ..runtime.stop_signals import stop_signals
@@ -43,6 +44,7 @@ MOST_EMPTY = 2
 """Number of checks in a row that find the scene empty after which training stops."""
 
 
+@unaffected
 def fit(
     config: TrainConfig,
     data: Dataset,
@@ -75,7 +77,7 @@ def fit(
         watcher: shown the state between steps whenever it asks for it; the scene stays bit-identical.
 
     Returns:
-        the scene after the last step, in every process.
+        the scene after the last step, in every process; its ``folder`` is the run directory.
 
     Raises:
         UserError: the configuration cannot run, a checkpoint does not fit or cannot be written, an image is missing,
@@ -120,7 +122,9 @@ def fit(
             except ProcessLost as lost:
                 raise _process_lost(state, folder, lost) from lost
         state.motion.eval()
-        return state.scene()
+        scene = state.scene()
+        scene.folder = folder.path.absolute()
+        return scene
 
 
 def _end_here(state: TrainState, folder: RunFolder) -> None:

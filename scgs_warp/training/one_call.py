@@ -13,6 +13,7 @@ from ..data.dataset import Dataset
 from ..data.synthetic.builtin import make_synthetic
 from ..errors import UserError
 from ..runtime import environment
+from ..runtime.caller_settings import unaffected
 from ..runtime.progress import Report, quiet, reported, say
 from ..visualization.films import Scene
 from .dataset_advice import advise, survey
@@ -24,6 +25,7 @@ BUILTIN = Path("data/figure")
 """Folder in which the built-in scene is made on first use."""
 
 
+@unaffected
 def train(
     data: str | Path | Dataset | None = None,
     preset: PresetName = "cpu",
@@ -77,9 +79,7 @@ def train(
 def _trained(config: TrainConfig, data: str | Path | Dataset | None, folder: Path, device: str, resume: bool) -> Scene:
     if isinstance(data, Dataset):
         say("\n".join(advise(survey(data), config, device)))
-        scene = fit(config, data, output=folder, device=device, resume=resume)
-        scene.folder = folder.absolute()
-        return scene
+        return fit(config, data, output=folder, device=device, resume=resume)
     if data is None:
         make_synthetic(BUILTIN, device=device)
     source = BUILTIN if data is None else Path(data)
@@ -87,7 +87,6 @@ def _trained(config: TrainConfig, data: str | Path | Dataset | None, folder: Pat
     say("\n".join(advise(survey(training), config, device)))
     settings = settings_of(config, source)
     scene = fit(config, training, output=folder, device=device, test=test, resume=resume, settings=settings)
-    scene.folder = folder.absolute()
     write_results(scene, test, folder, frames=0)
     return scene
 

@@ -6,9 +6,11 @@ import json
 from pathlib import Path
 
 import pytest
+import torch
 
 import scgs_warp
-from helpers.tiny import tiny_dataset, write_dnerf
+from helpers.tiny import tiny_config, tiny_dataset, write_dnerf
+from helpers.torch_settings import SETTINGS
 from scgs_warp.errors import UserError
 
 TINY = {
@@ -43,7 +45,18 @@ def test_a_folder_becomes_a_scene_and_a_run(tmp_path, monkeypatch, capsys):
 
 def test_a_data_set_in_memory_trains(tmp_path, capsys):
     scene = scgs_warp.train(tiny_dataset(6), output=tmp_path / "run", **TINY)
+    assert scene.folder == tmp_path / "run"
     assert scene.step == 60 and "data: 6 frames of 48 x 48" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("setting", SETTINGS)
+def test_what_the_caller_has_set_for_torch_changes_nothing(setting, tmp_path):
+    data = tiny_dataset(4, 24)
+    plain = scgs_warp.fit(tiny_config(30), data, output=tmp_path / "plain")
+    with SETTINGS[setting]():
+        changed = scgs_warp.fit(tiny_config(30), data, output=tmp_path / "changed")
+    assert changed.folder == tmp_path / "changed"
+    assert all(torch.equal(value, changed.tensors()[name]) for name, value in plain.tensors().items())
 
 
 @pytest.mark.parametrize(
