@@ -10,7 +10,8 @@ from pathlib import Path
 from ..errors import UserError, shell_words
 from .readers.transforms import SUFFIXES as IMAGES
 
-VIDEOS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".gif")
+FILMS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".mts", ".m2ts", ".3gp", ".wmv")
+VIDEOS = (*FILMS, ".gif")
 ARCHIVES = (".zip", ".r3d", ".tar", ".gz", ".tgz", ".bz2", ".xz", ".7z", ".rar", ".zst")
 SPLATS = (".ply", ".splat", ".spz", ".sog", ".ksplat")
 DEEPEST, MOST_FOLDERS = 3, 200

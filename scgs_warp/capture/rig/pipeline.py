@@ -23,6 +23,7 @@ from ..journal import Journal, disk_errors
 from ..source import Video, read_rgb
 from ..writing import FILE
 from . import adjustment, cameras, own_lenses, still, synchronisation
+from .common_size import CommonSize, common_size, common_size_of
 from .instants import Recorded, TimeLine, recorded, time_line
 from .neural_video import POSES, KnownCameras, known_cameras, write_neural_video
 from .points import points_at
@@ -81,7 +82,7 @@ def _capture(rig: _Rig, known: KnownCameras | None) -> RigResult:
     request, folder, files, names, show = rig.request, rig.folder, rig.files, rig.names, rig.show
     before = rig.journal.finished
     starts = [0.0] * len(files) if known is not None and request.offsets is None else rig.starts()
-    line = rig.frames(starts, everything=known is not None)
+    line = rig.frames(starts, known is not None)
     if known is not None:
         if not before:
             found = rig.points(known.cameras(rig.size_of))
@@ -97,10 +98,10 @@ def _capture(rig: _Rig, known: KnownCameras | None) -> RigResult:
     lines = [rig.describe(line), rig.describe_clock(starts)]
     lines += [f"note: {', '.join(missing)} shares too little with the others and is left out"] if missing else []
     lines += own_lenses.describe_lenses(solved) if request.lens == "auto" else []
-    lines += [*rig.cut_off(), *rig.unadjusted(), *rig.unsteady()]
+    lines += [*rig.size.describe(names), *rig.cut_off(), *rig.unadjusted(), *rig.unsteady()]
     if not before:
         extra = rig.points(solved.cameras)
-        write_rig(folder, solved, extra, names, line, held_out, rig.picture, show)
+        write_rig(folder, solved, extra, names, line, held_out, rig.picture, show, rig.size.turns)
     return RigResult(names, starts, [n for n in names if n not in missing], held_out, lines, before)
 
 
@@ -121,6 +122,7 @@ class _Rig:
         self.journal = Journal(folder, self._digest, marker)
         self.work = self.journal.work
         self.recorded: list[Recorded] = []
+        self.size = CommonSize(request.size, [0] * len(files), None)
 
     def _digest(self, earlier: bool) -> str:
         return hashlib.sha256("".join(video.digest(earlier) for video in self.videos).encode()).hexdigest()
@@ -146,8 +148,8 @@ class _Rig:
         silent = [file.name for file, sound in zip(self.files, sounds) if sound is None]
         if silent:
             raise UserError(
-                f"{silent[0]}: has no sound to synchronise by; give --offsets, the second at which each video begins, "
-                "or --offsets 0 if all begin at once"
+                f"{', '.join(silent)}: no sound to synchronise by; give --offsets, the second at which each video "
+                "begins, or --offsets 0 if all begin at once"
             )
         clock = synchronisation.synchronise(sounds)
         lost = [file.name for file, start in zip(self.files, clock.starts) if not np.isfinite(start)]
@@ -166,39 +168,44 @@ class _Rig:
         off = as_number(stored.get("disagreement")) or 0.0
         return f"begins by sound, in seconds: {begins}; pairs of cameras disagree by {1000 * off:.1f} ms"
 
-    def frames(self, starts: list[float], everything: bool) -> TimeLine:
-        """Choose the instants, and write each camera's frames."""
+    def frames(self, starts: list[float], known: bool) -> TimeLine:
+        """Choose the instants, and write each camera's frames. Those of known cameras are all taken, as they are."""
         request, folder = self.request, self.work / "frames"
         self.recorded = [recorded(file) for file in self.files]
         own = [each.seconds for each in self.recorded]
-        count = len(own[0]) if everything and request.frames is None else request.frames
+        count = len(own[0]) if known and request.frames is None else request.frames
         line = time_line(self.names, starts, own, count, request.start, request.end)
 
-        def make() -> bool:
+        def make() -> dict[str, Any]:
             folder.mkdir(exist_ok=True)
+            size = CommonSize(request.size, [0] * len(own), None) if known else common_size(self.videos, request.size)
             with self.show(line.frames.size, "writing frames") as bar:
                 for camera, video in enumerate(self.videos):
-                    self._unpack(video, camera, line, bar)
-            return True
+                    self._unpack(video, camera, line, size, bar)
+            return size._asdict()
 
         settings = [request.start, request.end, count, request.size, [round(start, 6) for start in starts]]
-        self.journal.stage("frames", settings, make, lambda: shutil.rmtree(folder, ignore_errors=True))
+        stored = self.journal.stage("frames", settings, make, lambda: shutil.rmtree(folder, ignore_errors=True))
+        size = common_size_of(stored, len(own))
+        if size is None:
+            raise self.journal.damaged("frames")
+        self.size = size
         return line
 
-    def _unpack(self, video: Video, camera: int, line: TimeLine, bar: Any) -> None:
+    def _unpack(self, video: Video, camera: int, line: TimeLine, size: CommonSize, bar: Any) -> None:
         wanted: dict[int, list[int]] = {}
         for instant, index in enumerate(line.frames[camera].tolist()):
             wanted.setdefault(index, []).append(instant)
         left, own = len(line.seconds), self.recorded[camera]
         tolerated = 0.5 * float(np.median(np.diff(own.seconds)))
-        for frame in video.frames(self.request.size, wanted):
+        for frame in video.frames(size.longest, wanted):
             if own.timed and abs(frame.seconds - own.seconds[frame.index]) > tolerated:
                 raise UserError(
                     f"{video.path}: frames before second {frame.seconds:.2f} cannot be decoded; copy it again from "
                     "where it was recorded, or leave out this part of all videos (--start, --end)"
                 )
             for instant in wanted[frame.index]:
-                write_png(self.picture_file(camera, instant), frame.image)
+                write_png(self.picture_file(camera, instant), np.rot90(frame.image, size.turns[camera]))
                 left -= 1
                 bar.advance()
             if left == 0:

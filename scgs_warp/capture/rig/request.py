@@ -8,11 +8,12 @@ from pathlib import Path
 from typing import Literal
 
 from ...data.natural_order import natural
+from ...data.unknown import FILMS
 from ...errors import UserError
 from ..features import CameraModel
+from ..folder_content import SUFFIXES, files_in, folders_in
 from ..limits import check_limits
 
-VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".mkv", ".avi", ".webm")
 FEWEST_CAMERAS = 2
 
 
@@ -53,11 +54,17 @@ def videos_of(folder: Path) -> list[Path]:
     """
     if not folder.is_dir():
         raise UserError(f"--rig {folder}: no such folder; give the folder that holds one video per camera")
-    found = [path for path in folder.iterdir() if path.suffix.lower() in VIDEO_SUFFIXES and path.is_file()]
+    found = [path for path in folder.iterdir() if path.suffix.lower() in FILMS and path.is_file()]
     files = sorted((path for path in found if not path.name.startswith(".")), key=lambda path: natural(path.name))
     if len(files) < FEWEST_CAMERAS:
+        of_images = [inner.name for inner in folders_in(folder) if files_in(inner, SUFFIXES)]
+        if len(of_images) >= FEWEST_CAMERAS:
+            raise UserError(
+                f"--rig {folder}: holds folders of images ({of_images[0]} to {of_images[-1]}); make a video of each, "
+                "all with one frame rate, and give --offsets 0 if they began at once"
+            )
         raise UserError(
-            f"--rig {folder}: holds {len(files)} videos ({', '.join(VIDEO_SUFFIXES)}); give one video per camera, at "
+            f"--rig {folder}: holds {len(files)} videos ({', '.join(FILMS)}); give one video per camera, at "
             f"least {FEWEST_CAMERAS}"
         )
     stems = [path.stem for path in files]

@@ -4,7 +4,7 @@ points."""
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,7 @@ from ...data.readers.transforms import OPENGL_TO_OPENCV
 from ...visualization.video import write_png
 from .. import pictures
 from ..similarity import upright
-from ..writing import FILE, POINTS, CapturedScene, Pinhole, pinhole_of, write_text
+from ..writing import FILE, POINTS, CapturedScene, Pinhole, as_held, pinhole_of, write_text
 from .cameras import RigCamera, RigSolution
 from .instants import TimeLine
 
@@ -56,6 +56,7 @@ def write_rig(
     held_out: str,
     picture: Callable[[int, int], np.ndarray],
     show: Callable[[int, str], AbstractContextManager[Any]],
+    turns: Sequence[int] = (),
 ) -> None:
     """Write ``images/``, ``points.ply``, a plot of the cameras, and then ``transforms.json``, whose presence marks a
     complete folder.
@@ -66,12 +67,13 @@ def write_rig(
         held_out: name of the camera for ``test``.
         picture: function from the numbers of a camera and an instant to the recorded image.
         show: shows progress.
+        turns: quarter turns of the pictures of all cameras, by number; empty without any.
     """
     (folder / "images").mkdir(exist_ok=True)
     pinholes = common_pinholes(solved.cameras)
     all_points, colors = np.concatenate([solved.points, points[0]]), np.concatenate([solved.colors, points[1]])
     viewmats = np.stack([camera.viewmat for camera in solved.cameras.values()])
-    moved = upright(viewmats, all_points)
+    moved = upright(as_held(viewmats, [turns[number] for number in solved.cameras if turns]), all_points)
     turned = dict(zip(solved.cameras, moved.viewmats(viewmats)))
     instants, times = len(line.seconds), line.times(list(solved.cameras))
     frames, splits = [], {"train": [], "test": []}

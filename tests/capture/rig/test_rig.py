@@ -30,6 +30,7 @@ from scgs_warp.errors import UserError
 LATE = [4, 0, 2, 7, 1, 10]
 """Frames by which the cameras begin late: up to half a second."""
 COUNT = 18
+DOUBLE = np.ones((2, 2, 1), np.uint8)
 
 
 @contextmanager
@@ -161,6 +162,22 @@ def test_a_folder_is_complete_once_all_is_written(films, captured, tmp_path, mon
     assert not (tmp_path / "out/poses_bounds.npy").exists()
 
 
+def test_cameras_that_are_held_otherwise_or_have_more_pixels_are_used_whole(films, tmp_path):
+    """Pictures of the one are turned, those of the other reduced, instead of cut."""
+    folder = tmp_path / "rig"
+    shutil.copytree(films.folder, folder)
+    for name, change in (("cam2", lambda image: np.rot90(image, 3)), ("cam4", lambda image: np.kron(image, DOUBLE))):
+        pictures = [np.ascontiguousarray(change(still.image)) for still in Video(folder / f"{name}.mp4").frames(1000)]
+        write_film(folder / f"{name}.mp4", pictures, FPS, 14, None)
+    made = run(folder, tmp_path / "out", offsets=tuple(films.starts.tolist()))
+    assert len(made.registered) == 6 and any("cam2 are turned by a quarter" in line for line in made.lines)
+    data = load(tmp_path / "out")
+    assert min(data[0].image.shape[:2]) > 0.9 * 180 and max(data[0].image.shape[:2]) > 0.9 * 320
+    content = json.loads((tmp_path / "out/transforms.json").read_text())
+    ups = {f["camera"]: np.array(f["transform_matrix"])[:3, 1] for f in content["frames"]}
+    assert all(up[2] > 0.8 for name, up in ups.items() if name != "cam2"), "the world is upright"
+
+
 def test_videos_of_neural_3d_video_are_unpacked(films, tmp_path, capsys):
     """With cameras of their own, all begin at once; the reader loads what comes of it, with points."""
     source = tmp_path / "scene"
@@ -232,7 +249,7 @@ def test_silent_films_and_blank_films(tmp_path):
     source.mkdir()
     for index in range(3):
         write_film(source / f"cam{index}.mp4", [np.full((64, 96, 3), 100, np.uint8)] * 10, 10.0, 20, None)
-    with pytest.raises(UserError, match=r"cam0\.mp4: has no sound .*--offsets 0"):
+    with pytest.raises(UserError, match=r"cam0\.mp4.*: no sound .*--offsets 0"):
         run(source, tmp_path / "out")
     with pytest.raises(UserError, match="no two cameras see enough in common"):
         run(source, tmp_path / "blank", offsets=(0.0,))
@@ -247,7 +264,7 @@ def test_frames_of_other_containers_have_their_moments(tmp_path, kind):
         encoded(file, 40)
     rig = pipeline._Rig(RigRequest(files[0].parent), tmp_path / "out", files, "x", "cpu", silent)
     with rig.journal.started():
-        line = rig.frames([0.0, 0.08], everything=False)
+        line = rig.frames([0.0, 0.08], known=False)
     np.testing.assert_allclose(line.moments, np.tile(np.arange(38) / 25, (2, 1)), atol=1e-9)
     shown = list(Video(files[1]).frames(1280))
     assert all(np.array_equal(rig.picture(1, instant), shown[instant].image) for instant in range(38))
@@ -263,7 +280,7 @@ def test_films_that_are_cut_off_or_damaged(tmp_path):
     (source / "a.mp4").write_bytes(content[: 6 * len(content) // 10])
     rig = pipeline._Rig(RigRequest(source), tmp_path / "out", [source / "a.mp4", source / "b.mp4"], "x", "cpu", silent)
     with rig.journal.started():
-        line = rig.frames([0.0, 0.0], everything=False)
+        line = rig.frames([0.0, 0.0], known=False)
     assert 1.0 < line.seconds[-1] < 3.5 and len(rig.cut_off()) == 1
     assert re.search(r"a\.mp4: \d\d of 100 frames can be decoded, until second", rig.cut_off()[0])
     spoil(source / "b.mp4", 0.25, 0.1)
