@@ -14,11 +14,14 @@ MIN_LINKED = 0.8
 """Smallest useful share of the pairs of consecutive frames that have matches."""
 MAX_PLANAR = 0.97
 """Share of frame pairs explained by one homography; above it, the camera probably rotates without moving."""
+STILL = 0.002
+"""Motion of matches, as a share of the longer side, below which the camera stands still."""
 MIN_ARC = 2.0
 """Smallest useful angle between the rays to a point, degrees; at smaller angles, depth is unreliable."""
 MAX_MASKED = 0.5
 """Share of masked pixels above which masks, and not a lack of texture, leave few features; masks that are found cover
 less."""
+STANDS_STILL = "the camera stands still, so that nothing tells depth"
 GOOD_SHARE = 0.9
 """Share of registered frames above which the user gets no note."""
 
@@ -33,6 +36,8 @@ class Outcome(NamedTuple):
     links: Links
     masked: float
     """Share of pixels that are masked."""
+    exhaustive: bool = False
+    """True if each frame was matched with each."""
 
 
 def likely_reason(outcome: Outcome) -> str:
@@ -48,19 +53,20 @@ def likely_reason(outcome: Outcome) -> str:
             f"there is little to recognise ({links.features} features a frame): film something with texture, in more "
             "light, or give a larger --size"
         )
+    if links.moved < STILL:
+        return f"{STANDS_STILL}: film from several places, walking sideways around the scene, or with several cameras"
     if outcome.masked > 0.3 and (links.linked < MIN_LINKED or links.inliers < MIN_INLIERS):
         return f"masks hide {100 * outcome.masked:.0f} % of the frames: give --masks none, or masks of your own"
     if links.linked < MIN_LINKED or links.inliers < MIN_INLIERS:
         return (
             f"frames that follow each other have little in common ({links.inliers} matches): give --frames "
-            f"{2 * outcome.picked}, or film more slowly"
+            f"{2 * outcome.picked}, film more slowly, or use a part without cuts (--start, --end)"
         )
     if links.planar > MAX_PLANAR or (outcome.registered and outcome.arc < MIN_ARC):
         return "the camera turns but hardly moves: film from several places, walking sideways around the scene"
     if outcome.registered >= 2:
-        return (
-            "the film falls into parts that do not connect: give --matching exhaustive, or use a part (--start, --end)"
-        )
+        more = f"--frames {2 * outcome.picked}" if outcome.exhaustive else "--matching exhaustive"
+        return f"the film falls into parts that do not connect: give {more}, or use a part (--start, --end)"
     return "no two frames gave a beginning: give --fov if you know it, or film with more movement"
 
 
@@ -79,6 +85,8 @@ def notes(outcome: Outcome) -> list[str]:
     lines = []
     if outcome.registered < GOOD_SHARE * outcome.picked:
         lines.append(f"note: {outcome.picked - outcome.registered} frames have no camera; {likely_reason(outcome)}")
+    elif outcome.links.moved < STILL:
+        lines.append(f"note: {STANDS_STILL}; the cameras found are those of what moves")
     elif outcome.arc < MIN_ARC:
         lines.append(f"note: rays to a point differ by {outcome.arc:.1f} degrees only; depth will be uncertain")
     return lines

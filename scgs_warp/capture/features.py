@@ -50,6 +50,8 @@ class FrameFiles(NamedTuple):
     """Names in the folder, in order of time; all frames have the same size and the same camera."""
     masks: Path | None
     """Folder of masks with the same names, black on moving pixels; None without masks."""
+    cut_out: bool = False
+    """True if the frames have alpha, and masks are black on what it hides, too."""
 
 
 def begin(
@@ -234,6 +236,9 @@ class Links(NamedTuple):
     """Share of pairs of consecutive frames with inlier matches."""
     planar: float
     """Share of matched pairs explained by one homography: the camera only rotated, or saw a plane."""
+    moved: float = 1.0
+    """Motion of inlier matches from one frame to the other, as a share of the longer side of the frames: the median, of
+    the median in each pair. It is near 0 if the camera stands still, whatever moves before it."""
 
 
 def links(database: Path, frame_files: FrameFiles) -> Links:
@@ -247,12 +252,21 @@ def links(database: Path, frame_files: FrameFiles) -> Links:
         ]
         counts = [0 if pair is None else len(pair.inlier_matches) for pair in geometries]
         flat = _configs(pycolmap, ("PLANAR", "PANORAMIC", "PLANAR_OR_PANORAMIC"))
-        planar = [pair.config in flat for pair in storage.read_two_view_geometries()[1] if len(pair.inlier_matches)]
+        numbers, found = storage.read_two_view_geometries()
+        matched = [(number, pair) for number, pair in zip(numbers, found) if len(pair.inlier_matches)]
+        planar = [pair.config in flat for _, pair in matched]
+        points = {image: storage.read_keypoints(image)[:, :2] for image in images}
+        camera = storage.read_camera(storage.read_image(images[0]).camera_id)
+        moves = []
+        for number, pair in matched:
+            (a, b), (one, two) = pycolmap.pair_id_to_image_pair(number), pair.inlier_matches.T
+            moves.append(float(np.median(np.linalg.norm(points[a][one] - points[b][two], axis=1))))
     return Links(
         int(np.median(features)) if features else 0,
         int(np.median(counts)) if counts else 0,
         float(np.mean(np.array(counts) > 0)) if counts else 0.0,
         float(np.mean(planar)) if planar else 0.0,
+        float(np.median(moves)) / max(camera.width, camera.height) if moves else 1.0,
     )
 
 

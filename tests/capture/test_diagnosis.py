@@ -17,7 +17,11 @@ def test_the_likeliest_reason_is_given():
     assert "--masks none" in likely_reason(Outcome(50, 4, 9, Links(2000, 12, 0.5, 0.2), 0.4))
     assert "walking" in likely_reason(Outcome(50, 0, 0, Links(2000, 300, 1.0, 1.0), 0.1))
     assert "walking" in likely_reason(Outcome(50, 50, 0.4, LINKS, 0.1))
+    for links in (LINKS, Links(800, 480, 1.0, 0.02), Links(1000, 30, 0.7, 0.5)):
+        assert "camera stands still" in likely_reason(Outcome(50, 0, 0, links._replace(moved=0.0004), 0.35))
+    assert "stands still" in notes(Outcome(50, 50, 9, LINKS._replace(moved=0.0004), 0.1))[0]
     assert "--matching" in likely_reason(Outcome(50, 20, 9, LINKS, 0.1))
+    assert "give --frames 100, or" in likely_reason(Outcome(50, 20, 9, LINKS, 0.1, True)), "matching was exhaustive"
     line = too_few("out", Outcome(50, 20, 9, LINKS, 0.1))
     assert line.startswith("out: 20 of 50 frames registered") and "--least 0.4 " in line
     assert "--least" not in too_few("out", Outcome(50, 0, 0, LINKS, 0.1))
