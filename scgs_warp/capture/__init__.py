@@ -4,7 +4,8 @@ camera poses (pycolmap) and undistortion."""
 from __future__ import annotations
 
 from .imports import ImportResult, import_scene
-from .pipeline import CaptureRequest, CaptureResult, capture
+from .pipeline import CaptureResult, capture
+from .request import CaptureRequest
 from .rig import RigRequest, RigResult, capture_rig
 
 __all__ = [

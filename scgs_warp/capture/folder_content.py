@@ -11,8 +11,10 @@ from ..data.unknown import VIDEOS
 from ..errors import UserError
 
 SUFFIXES = (".png", ".jpg", ".jpeg", ".webp", ".tif", ".tiff", ".bmp")
-UNREAD = (".heic", ".heif", ".hif", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2")
+UNREAD = (".heic", ".heif", ".hif", ".avif", ".jxl", ".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2")
 """Suffixes of photographs in formats of phones and cameras that are not read."""
+FEWEST_IMAGES = 6
+"""Smallest number of images that can be meant where there is a film as well."""
 MOST_FOLDERS = 200
 """Number of folders in which images are looked for."""
 
@@ -35,16 +37,16 @@ def images_in(folder: Path) -> list[Path]:
     Raises:
         UserError: it holds none; the message names what it holds instead.
     """
-    files = files_in(folder, SUFFIXES)
-    if files:
+    files, films = files_in(folder, SUFFIXES), files_in(folder, VIDEOS)
+    if files and (len(files) >= FEWEST_IMAGES or not films):  # A film may have a picture of itself beside it.
         return files
-    unread, films = files_in(folder, UNREAD), files_in(folder, VIDEOS)
-    below = next((inner for inner in _folders(folder) if files_in(inner, SUFFIXES)), None)
-    if unread:
+    unread = files_in(folder, UNREAD)
+    below = next((inner for inner in folders_in(folder) if files_in(inner, SUFFIXES)), None)
+    if unread and (len(unread) >= FEWEST_IMAGES or not films):
         raise UserError(f"{folder}: holds {_counted(unread)}, which cannot be read; save them as JPEG")
     if films:
         more = f", or --rig {folder} for films of one rig" if len(films) > 1 else ""
-        raise UserError(f"{folder}: holds no images, but {films[0].name}; give {films[0]}{more}")
+        raise UserError(f"{folder}: holds {len(files) or 'no'} images, but {films[0].name}; give {films[0]}{more}")
     if below is not None:
         raise UserError(f"{folder}: holds no images, but {below.name} does; give {below}")
     raise UserError(f"{folder}: holds no images ({', '.join(SUFFIXES)}); give the folder that does, or a video")
@@ -58,7 +60,8 @@ def photographs_left_out(folder: Path) -> list[str]:
     return [f"note: {folder}: {_counted(unread)} are left out; save them as JPEG, too"] if unread else []
 
 
-def _folders(folder: Path) -> list[Path]:
+def folders_in(folder: Path) -> list[Path]:
+    """Return the folders in a folder that are not hidden, in the natural order of their names, unless they are many."""
     found = [inner for inner in folder.iterdir() if is_shown(inner) and inner.is_dir()]
     return sorted(found, key=lambda inner: natural(inner.name))[:MOST_FOLDERS]
 

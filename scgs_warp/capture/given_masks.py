@@ -23,7 +23,12 @@ HIDES_ALL = 0.999
 
 
 def read_masks(
-    path: Path, source: Source, indices: Sequence[int], names: Sequence[str], size: tuple[int, int]
+    path: Path,
+    source: Source,
+    indices: Sequence[int],
+    names: Sequence[str],
+    size: tuple[int, int],
+    turns: Sequence[int] = (),
 ) -> Iterator[np.ndarray]:
     """Read the user's masks.
 
@@ -34,6 +39,7 @@ def read_masks(
     Args:
         indices, names: indices, ascending, and file names of the picked frames.
         size: (width, height) of the frames.
+        turns: quarter turns, counter-clockwise, of the frames that were turned; empty if none was.
 
     Yields:
         [H, W] bool for each picked frame, at ``size``, True on moving pixels.
@@ -47,8 +53,8 @@ def read_masks(
     else:
         images = _of_film(masks, source, indices, max(size))
     shares = []
-    for image in images:
-        mask = _fitted(image, path, size)
+    for image, count in zip(images, turns or [0] * len(indices)):
+        mask = _fitted(image, path, size, count)
         shares.append(float(mask.mean()))
         yield mask
     if np.mean(shares) > HIDES_ALL:
@@ -128,8 +134,10 @@ def _of_folder(path: Path, files: Sequence[Path]) -> Iterator[np.ndarray]:
         yield cv2.cvtColor(gray, cv2.COLOR_GRAY2RGB)
 
 
-def _fitted(image: np.ndarray, path: Path, size: tuple[int, int]) -> np.ndarray:
-    """Return [H, W] bool at ``size``, True on black."""
+def _fitted(image: np.ndarray, path: Path, size: tuple[int, int], turns: int = 0) -> np.ndarray:
+    """Return [H, W] bool at ``size``, True on black, of a mask that may have to be turned as its frame was."""
+    if (image.shape[1] > image.shape[0]) != (size[0] > size[1]):
+        image = np.ascontiguousarray(np.rot90(image, turns))
     ratio = image.shape[1] / image.shape[0] / (size[0] / size[1])
     if abs(ratio - 1) > 0.02:
         raise UserError(

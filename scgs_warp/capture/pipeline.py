@@ -4,10 +4,6 @@ from __future__ import annotations
 
 import math
 import shutil
-from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager
-from dataclasses import dataclass
-from itertools import takewhile
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,84 +13,18 @@ from ..errors import UserError
 from ..runtime.progress import progress
 from ..storage.json_files import as_number
 from ..visualization.video import write_png
-from . import bundle_adjustment, features, mapping, moving, picking, pictures, writing
+from . import bundle_adjustment, features, mapping, moving, pictures, writing
 from .colmap import remove_database
-from .completeness import Incomplete
 from .diagnosis import Outcome, notes, too_few
-from .features import CameraModel, FrameFiles, Matching
+from .features import FrameFiles
 from .folder_content import photographs_left_out
 from .given_masks import read_masks
 from .journal import Journal, disk_errors
-from .limits import check_limits
-from .source import Source, SourceFrame, open_source, read_rgb
+from .picked_frames import PickedFrames, ShowProgress, pick_frames
+from .request import MIN_FRAMES, CaptureRequest, check
+from .source import Source, is_hidden, open_source, read_rgb
 
-MAX_SECONDS = 1e9
-"""Largest plausible time in a film, seconds."""
-MIN_FRAMES = 6
-"""Smallest number of frames for a capture."""
 SHEET, CAMERAS = "contact_sheet.png", "cameras.png"
-VIDEO_FRAMES = 150
-
-ShowProgress = Callable[[int, str], AbstractContextManager[Any]]
-
-
-@dataclass(frozen=True)
-class CaptureRequest:
-    """Settings of a capture."""
-
-    source: Path
-    """A video, or a folder of images."""
-    frames: int | None = None
-    """Largest number of frames; None: ``VIDEO_FRAMES`` for a video, all images for a folder."""
-    start: float | None = None
-    end: float | None = None
-    """End of the part of the video to use, seconds; ``start`` is its beginning."""
-    size: int = 1280
-    """Largest size of the longer side of the images, pixels."""
-    masks: str = "auto"
-    """``auto``: masks of independently moving pixels; ``none``: no masks; anything else: a path of masks."""
-    matching: Matching = "auto"
-    camera_model: CameraModel = "SIMPLE_RADIAL"
-    fov: float | None = None
-    """Horizontal field of view, degrees; None if unknown."""
-    features: int = 4096
-    """Largest number of features per frame."""
-    least: float = 0.5
-    """Smallest share of the frames that must get a camera."""
-    seed: int = 0
-    keep: writing.Keep = "all"
-    """What the data set shows. ``moving`` needs given masks."""
-
-
-class PickedFrames(NamedTuple):
-    """The picked frames of a source."""
-
-    indices: list[int]
-    """Indices in the source."""
-    seconds: list[float]
-    names: list[str]
-    """File names of the images of a folder; empty strings for a video."""
-    span: tuple[float, float]
-    """Times of the video, in seconds, that become times 0 and 1."""
-    size: tuple[int, int]
-    """(width, height)"""
-    seen: int
-    """Number of frames in the source."""
-    blurred: int
-    alike: int
-    decoded: int = 0
-    """Number of frames of an incomplete video that can be decoded."""
-    announced: int = 0
-    """Number of frames of an incomplete video according to its header; 0 if nothing is missing."""
-
-    @property
-    def incomplete(self) -> Incomplete | None:
-        """What is there of an incomplete video."""
-        return Incomplete(self.decoded, self.announced, self.span[1]) if self.announced else None
-
-    @property
-    def files(self) -> list[str]:
-        return [f"{moving.frame_name(index)}.png" for index in self.indices]
 
 
 class CaptureResult(NamedTuple):
@@ -105,29 +35,6 @@ class CaptureResult(NamedTuple):
     """Description of the result, for the user."""
     made_before: bool
     """True if the folder was already complete."""
-
-
-def check(request: CaptureRequest) -> None:
-    """Check the values of a request.
-
-    Raises:
-        UserError: naming the option, its value and the remedy.
-    """
-    if request.frames is not None and request.frames < MIN_FRAMES:
-        raise UserError(f"--frames {request.frames}: give at least {MIN_FRAMES}")
-    check_limits(request)
-    start, end = request.start or 0.0, math.inf if request.end is None else request.end
-    if not 0.0 <= start < end:
-        raise UserError(f"--start {start:g} --end {end:g}: give two seconds of the video, the earlier one as --start")
-    if not request.masks.strip():
-        raise UserError("--masks: is followed by an empty name; give auto, none, a folder or a video")
-    if request.keep == "moving" and request.masks in ("auto", "none"):
-        raise UserError(
-            "--keep-static off: needs masks of the whole mover, black where it is; give --masks DIR or --masks "
-            "FILE.mp4 (masks that are found cover only a part of it)"
-        )
-    if request.keep == "static" and request.masks == "none":
-        raise UserError("--keep-moving off: needs masks; leave out --masks none, or give --masks DIR")
 
 
 def capture(
@@ -157,7 +64,7 @@ def _capture(
 ) -> CaptureResult:
     """Run or resume all stages."""
     folder, before = journal.folder, journal.finished
-    frames = _frames(request, source, journal, show)
+    frames = pick_frames(request, source, journal, show)
     _enough(request, frames)
     frame_files = _masks(request, source, frames, journal, show)
     if request.keep == "moving" and _share(journal) == 0.0:
@@ -188,81 +95,6 @@ def _enough(request: CaptureRequest, frames: PickedFrames) -> None:
     )
 
 
-def _frames(request: CaptureRequest, source: Source, journal: Journal, show: ShowProgress) -> PickedFrames:
-    """Pick the frames and write them."""
-    folder = journal.work / "frames"
-
-    def make() -> dict[str, Any]:
-        chosen = _choose(request, source, show)
-        wanted = dict.fromkeys(chosen.indices)
-        folder.mkdir(exist_ok=True)
-        size, names = (0, 0), []
-        with show(len(wanted), "writing frames") as bar:
-            for still in _until(source.frames(request.size), max(wanted, default=-1)):
-                if still.index in wanted:
-                    write_png(folder / f"{moving.frame_name(still.index)}.png", still.image)
-                    size = still.image.shape[1], still.image.shape[0]
-                    names.append(still.name)
-                    bar.advance()
-        return chosen._replace(size=size, names=names)._asdict()
-
-    settings = {key: getattr(request, key) for key in ("frames", "start", "end", "size")}
-    stored = journal.stage("frames", settings, make, lambda: shutil.rmtree(folder, ignore_errors=True))
-    frames = _frames_of(stored)
-    if frames is None:
-        raise journal.damaged("frames")
-    return frames
-
-
-def _frames_of(stored: Any) -> PickedFrames | None:
-    """Parse the picked frames from a journal; return None if the entry is malformed."""
-    try:
-        frames = PickedFrames(**{**stored, "span": tuple(stored["span"]), "size": tuple(stored["size"])})
-        totals = (frames.seen, frames.blurred, frames.alike, frames.decoded, frames.announced)
-        counts = (*frames.indices, *frames.size, *totals)
-        whole = all(isinstance(count, int) and 0 <= count < 2**31 for count in counts)
-        numbers = [as_number(second) for second in (*frames.seconds, *frames.span)]
-        times = all(number is not None and abs(number) <= MAX_SECONDS for number in numbers)
-        names = len(frames.names) in (0, len(frames.indices)) and all(isinstance(name, str) for name in frames.names)
-        lengths = len(frames.seconds) == len(frames.indices) and len(frames.span) == len(frames.size) == 2
-    except (KeyError, TypeError):
-        return None
-    return frames if whole and times and names and lengths else None
-
-
-def _until(stills: Iterator[SourceFrame], last: int) -> Iterator[SourceFrame]:
-    return takewhile(lambda still: still.index <= last, stills)
-
-
-def _choose(request: CaptureRequest, source: Source, show: ShowProgress) -> PickedFrames:
-    """Choose the frames to use; for a folder, all of them unless a number is given."""
-    start, end = request.start or 0.0, math.inf if request.end is None else request.end
-    with show(source.count, "looking at frames") as bar:
-        within = (
-            still
-            for still in takewhile(lambda still: still.seconds <= end or not source.video, _shown(source, bar))
-            if still.seconds >= start or not source.video
-        )
-        measures = picking.measure(within)
-    if not len(measures.index):
-        raise UserError(f"--start {start:g}: {source.path} ends before; give a second of the video")
-    if source.video or request.frames is not None:
-        picked = picking.pick(measures, request.frames or VIDEO_FRAMES)
-    else:
-        picked = picking.Selection(list(range(len(measures.index))), 0, 0)
-    seconds = measures.seconds[picked.places].tolist()
-    span = (float(measures.seconds[0]), float(measures.seconds[-1]))
-    indices = measures.index[picked.places].tolist()
-    there = (0, 0) if source.incomplete is None else source.incomplete[:2]
-    return PickedFrames(indices, seconds, [], span, (0, 0), len(measures.index), picked.blurred, picked.alike, *there)
-
-
-def _shown(source: Source, bar: Any) -> Iterator[SourceFrame]:
-    for still in source.frames(picking.SHARPNESS_SIDE):
-        yield still
-        bar.advance()
-
-
 def _masks(
     request: CaptureRequest, source: Source, frames: PickedFrames, journal: Journal, show: ShowProgress
 ) -> FrameFiles:
@@ -271,7 +103,7 @@ def _masks(
     files = frames.files
     if request.masks == "none":
         journal.stage("masks", "none", dict, lambda: shutil.rmtree(mask_folder, ignore_errors=True))
-        return FrameFiles(folder, files, None)
+        return FrameFiles(folder, files, None, frames.cut_out)
     path = Path(request.masks)
 
     def make() -> dict[str, Any]:
@@ -279,18 +111,21 @@ def _masks(
         if request.masks == "auto":
             masks = moving.find_moving(lambda k: read_rgb(folder / files[k]), len(files))
         else:
-            masks = read_masks(path, source, frames.indices, frames.names, frames.size)
+            whole = read_masks(path, source, frames.indices, frames.names, frames.whole_size, frames.turns)
+            masks = map(frames.bars.cut, whole)
         shares = []
         with show(len(files), "finding what moves" if request.masks == "auto" else "reading masks") as bar:
             for name, mask in zip(files, masks, strict=True):  # strict: masks are checked once the last one is read
-                write_png(mask_folder / name, np.repeat(np.where(mask, 0, 255).astype(np.uint8)[..., None], 3, 2))
                 shares.append(mask.mean())
+                if frames.cut_out:
+                    mask = mask | is_hidden(folder / name)
+                write_png(mask_folder / name, np.repeat(np.where(mask, 0, 255).astype(np.uint8)[..., None], 3, 2))
                 bar.advance()
         return {"share": float(np.mean(shares))}
 
     kind = "auto" if request.masks == "auto" else open_source(path).digest(journal.earlier)
     journal.stage("masks", kind, make, lambda: shutil.rmtree(mask_folder, ignore_errors=True))
-    return FrameFiles(folder, files, mask_folder)
+    return FrameFiles(folder, files, mask_folder, frames.cut_out)
 
 
 def _solve(
@@ -337,7 +172,8 @@ def _solve(
     solved = mapping.read_solution(model, frame_files)
     masked = 0.0 if frame_files.masks is None else _share(journal)
     registered, arc = (len(solved.places), solved.arc) if solved else (0, 0.0)
-    return Outcome(count, registered, arc, features.links(database, frame_files), masked), solved
+    exhaustive = len(chosen) == count * (count - 1) // 2
+    return Outcome(count, registered, arc, features.links(database, frame_files), masked, exhaustive), solved
 
 
 def _share(journal: Journal) -> float:
@@ -353,6 +189,10 @@ def _lines(request: CaptureRequest, frames: PickedFrames, outcome: Outcome) -> l
     left_out = f" ({frames.blurred} blurred, {frames.alike} alike)" if frames.blurred or frames.alike else ""
     missing = [] if frames.incomplete is None else [f"note: {request.source}: {frames.incomplete.describe()}"]
     missing += photographs_left_out(request.source) if request.source.is_dir() else []
+    turned = sum(turns > 0 for turns in frames.turns)
+    missing += [f"note: {turned} images are turned by a quarter, so that all have one lens"] if turned else []
+    missing += ["note: black bars beside the pictures are cut off"] if any(frames.bars) else []
+    missing += ["frames are cut out by alpha; what it hides is left out"] if frames.cut_out else []
     return [
         f"{outcome.picked} of {frames.seen} frames picked{left_out}, {frames.size[0]} x {frames.size[1]}; "
         f"{100 * outcome.masked:.0f} % of their pixels move; {outcome.links.features} features a frame",
@@ -377,6 +217,6 @@ def _write(
 ) -> None:  # fmt: skip
     with show(len(solved.places), "undistorting") as bar:
         pinhole = writing.undistort(frame_files, solved, folder, bar.advance, keep)
-    scene = writing.scene_of(frame_files, solved, pinhole, frames.seconds, frames.span)
+    scene = writing.scene_of(frame_files, solved, pinhole, frames.seconds, frames.span, frames.turns)
     pictures.cameras(folder / CAMERAS, scene)
     writing.write_scene(folder, scene, keep)

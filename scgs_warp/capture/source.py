@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import hashlib
 from array import array
+from collections import Counter
 from collections.abc import Container, Iterator, Sequence
+from contextlib import suppress
+from functools import cached_property
 from itertools import islice, pairwise
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
@@ -12,18 +15,22 @@ from typing import Any, NamedTuple, Protocol
 import cv2
 import numpy as np
 
-from ..data.images import is_complete, oversized_claim, size_text
+from ..data.images import INSPECTED, header_sizes, instead_of_image, is_complete, oversized_claim, size_text
 from ..data.name_times import moments_in_names
+from ..data.orientation import TURNS, read_orientation, upright
 from ..errors import UserError
+from ..storage.files import open_regular
+from . import cut_out
+from .as_shown import picture
 from .completeness import Incomplete, header_of, incomplete, lost_in_gaps
 from .folder_content import images_in
 from .frame_times import REORDERED, rising
-from .high_dynamic_range import is_high_dynamic_range, to_standard
 
 DIGEST_BYTES = 1 << 20
 """Number of bytes of a file that are hashed at a time. Digests of earlier versions saw as many at both ends only."""
 LONGEST = 1000
 """Largest time that names of images tell, as a multiple of that of images without gaps."""
+OPAQUE_SUFFIXES = (".jpg", ".jpeg", ".bmp")
 SAMPLE = 100
 """Number of stored pictures that show whether they have times of display."""
 
@@ -39,6 +46,10 @@ class SourceFrame(NamedTuple):
     """[H, W, 3] uint8 RGB"""
     name: str
     """Name of the image file; empty for a video."""
+    alpha: np.ndarray | None = None
+    """[H, W] uint8; None for a picture without alpha."""
+    turns: int = 0
+    """Number of quarter turns, counter-clockwise, by which the picture was turned to have the others' size."""
 
 
 class Source(Protocol):
@@ -107,10 +118,7 @@ class Video:
         try:
             container = av.open(str(self.path))
         except (FFmpegError, OSError, ValueError) as error:  # ValueError: metadata that is not text
-            reason = getattr(error, "strerror", None) or type(error).__name__
-            raise UserError(
-                f"{self.path}: is not a video that decodes ({reason}); save it as .mp4, or give a folder of images"
-            ) from None
+            raise UserError(f"{self.path}: {_no_video(self.path, error)}") from None
         if not container.streams.video:
             container.close()
             raise UserError(f"{self.path}: holds no pictures; give a video, or a folder of images")
@@ -134,7 +142,8 @@ class Video:
                             f"{self.path}: its pictures are {size_text(size)}, but {size_text(now)} from second "
                             f"{seconds:.2f} on; give an --end before {last:.2f}, or save it in one size"
                         )
-                    yield SourceFrame(index, seconds, _picture(frame, longest, shape), "")
+                    image, alpha = picture(frame, longest, shape)
+                    yield SourceFrame(index, seconds, image, "", alpha)
                 last = seconds
                 times.append(seconds)
         if read.decoded == 0:
@@ -153,6 +162,17 @@ class Video:
 
     def digest(self, earlier: bool = False) -> str:
         return _digest_of_ends([self.path]) if earlier else _digest([self.path])
+
+
+def _no_video(path: Path, error: Exception) -> str:
+    """Say what is in a file that is no video, and what to do."""
+    reason = getattr(error, "strerror", None) or type(error).__name__
+    with suppress(OSError), open_regular(path) as file:
+        start = file.read(INSPECTED)
+        other = instead_of_image(start, "video") if start else "is empty; copy it again from where it was recorded"
+        if other is not None:
+            return other
+    return f"is not a video that decodes ({reason}); save it as .mp4, or give a folder of images"
 
 
 def main_pictures(container: Any) -> Any:
@@ -202,38 +222,6 @@ def _lacks_times(container: Any, stream: Any) -> bool:
     return known == sorted(known)
 
 
-def _picture(frame: Any, longest: int, shape: float) -> np.ndarray:
-    """Return a decoded frame as displayed: upright, in sRGB, and with square pixels made from pixels ``shape`` times as
-    wide as high."""
-    width, height = frame.width * shape, frame.height
-    scale = min(1.0, longest / max(width, height))
-    rich = is_high_dynamic_range(frame.color_trc)
-    image = frame.to_ndarray(format="rgb48le" if rich else "rgb24")
-    if frame.interlaced_frame:
-        image = _one_field(image)
-    size = max(1, round(width * scale)), max(1, round(height * scale))
-    if size != (frame.width, frame.height):
-        image = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
-    if rich:
-        image = to_standard(image, frame.color_trc)
-    return rotate_image(image, getattr(frame, "rotation", 0) or 0)
-
-
-def _one_field(image: np.ndarray) -> np.ndarray:
-    """Replace every other row of an interlaced picture, which was recorded at another moment, by those beside it."""
-    image = image.copy()
-    own, other = image[0::2], image[1::2]
-    between = len(own) - 1
-    other[:] = own[: len(other)]
-    other[:between] = cv2.addWeighted(own[:-1], 0.5, own[1:], 0.5, 0.0)
-    return image
-
-
-def rotate_image(image: np.ndarray, degrees: float) -> np.ndarray:
-    """Rotate the image counter-clockwise by ``degrees``, rounded to a multiple of 90."""
-    return np.ascontiguousarray(np.rot90(image, round(degrees / 90) % 4))
-
-
 class Folder:
     """A folder of images, in the natural order of their names."""
 
@@ -251,21 +239,40 @@ class Folder:
         self.moments = _moments([file.name for file in self.files])
 
     def frames(self, longest: int) -> Iterator[SourceFrame]:
-        size = None
+        """Yield all images. Those of a camera that was held upright for some and not for others are turned to have the
+        size of most, so that all have one lens."""
+        usual = self._usual
+        size, turned = read_rgb(usual).shape[1::-1], turns_of(usual)
         for index, file in enumerate(self.files):
-            image = read_rgb(file)
-            size = size or image.shape[1::-1]
+            image, alpha = read_cut_out(file)
+            turns = 0
+            if image.shape[1::-1] == size[::-1] != size:
+                turns = (turned - turns_of(file)) % 4
+                turns = turns if turns % 2 else 1
+                image, alpha = np.rot90(image, turns), None if alpha is None else np.rot90(alpha, turns)
             if image.shape[1::-1] != size:
                 raise UserError(
-                    f"{file}: is {size_text(image.shape[1::-1])}, but {self.files[0].name} is {size_text(size)}; "
+                    f"{file}: is {size_text(image.shape[1::-1])}, but {usual.name} is {size_text(size)}; "
                     "give images of one camera and one size"
                 )
-            yield SourceFrame(index, self.moments[index], shrunk(image, longest), file.name)
+            image, alpha = _reduced(np.ascontiguousarray(image), alpha, longest)
+            yield SourceFrame(index, self.moments[index], image, file.name, alpha, turns)
+
+    @cached_property
+    def _usual(self) -> Path:
+        """First image of the size, as displayed, that most have."""
+        sizes = [tuple(header_sizes(file)[-1:]) for file in self.files]
+        return self.files[sizes.index(Counter(sizes).most_common(1)[0][0])]
 
     def digest(self, earlier: bool = False) -> str:
         if earlier:
             return _digest_of_ends(self.files)
         return _digest(self.files, [file.name for file in self.files])
+
+
+def turns_of(file: Path) -> int:
+    """Return the number of quarter turns, counter-clockwise, by which viewers turn a photograph."""
+    return TURNS.get(read_orientation(_bytes_of(file).data), (0, False))[0]
 
 
 def _moments(names: list[str]) -> list[float]:
@@ -283,21 +290,55 @@ def read_rgb(file: Path) -> np.ndarray:
     return cv2.cvtColor(read_image(file, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)
 
 
+def read_cut_out(file: Path) -> tuple[np.ndarray, np.ndarray | None]:
+    """Read an image as ``read_rgb`` does, and its alpha [H, W] uint8, None if all is opaque; what alpha hides is
+    black."""
+    image = read_rgb(file)
+    whole = None if file.suffix.lower() in OPAQUE_SUFFIXES else read_image(file, cv2.IMREAD_UNCHANGED)
+    if whole is None or whole.ndim != 3 or whole.shape[2] != 4 or whole.dtype.kind != "u":
+        return image, None
+    alpha = (whole[..., 3] >> (8 * whole.dtype.itemsize - 8)).astype(np.uint8)
+    alpha = upright(alpha, read_orientation(_bytes_of(file).data))
+    return cut_out.split(np.dstack([image, alpha])) if alpha.shape == image.shape[:2] else (image, None)
+
+
+def is_hidden(file: Path) -> np.ndarray:
+    """Return [H, W] bool, True where the alpha of an image hides it."""
+    image, alpha = read_cut_out(file)
+    return np.zeros(image.shape[:2], bool) if alpha is None else alpha < cut_out.HIDDEN
+
+
 def read_image(file: Path, flags: int) -> np.ndarray:
     """Read an image as OpenCV does with these flags; raise UserError if the file is not an image."""
+    data = _bytes_of(file)
+    claim = oversized_claim(data.data)
+    if claim is not None:
+        raise UserError(f"{file}: says it is {claim} in {data.size} bytes; save it again, smaller")
+    other = instead_of_image(data[:INSPECTED].tobytes())
+    if other is not None:
+        raise UserError(f"{file}: {other}")
     try:
-        data = np.fromfile(file, np.uint8)
-        claim = oversized_claim(data.data)
-        if claim is not None:
-            raise UserError(f"{file}: says it is {claim} in {data.size} bytes; save it again, smaller")
         image = cv2.imdecode(data, flags) if is_complete(data) else None
-    except OSError as error:
-        raise UserError(f"{file}: cannot be read ({error.strerror}); make the file readable") from None
     except cv2.error:
         image = None
     if image is None:
         raise UserError(f"{file}: is not an image that decodes; save it again as PNG or JPEG, or take it out")
     return image
+
+
+def _bytes_of(file: Path) -> np.ndarray:
+    try:
+        return np.fromfile(file, np.uint8)
+    except OSError as error:
+        raise UserError(f"{file}: cannot be read ({error.strerror}); make the file readable") from None
+
+
+def _reduced(image: np.ndarray, alpha: np.ndarray | None, longest: int) -> tuple[np.ndarray, np.ndarray | None]:
+    """Reduce a picture with alpha as ``shrunk`` does one without."""
+    if alpha is None:
+        return shrunk(image, longest), None
+    height, width = shrunk(image[..., 0], longest).shape
+    return cut_out.resized(image, np.ascontiguousarray(alpha), (width, height))
 
 
 def shrunk(image: np.ndarray, longest: int) -> np.ndarray:

@@ -16,16 +16,19 @@ from ..data.readers.transforms import OPENGL_TO_OPENCV
 from ..storage.files import write_atomically
 from ..visualization.video import write_png
 from .colmap import quiet
+from .cut_out import HIDDEN, moved
 from .features import FrameFiles
 from .mapping import CameraSolution
 from .similarity import upright
-from .source import read_rgb
+from .source import read_cut_out, read_rgb
 
 Keep = Literal["all", "moving", "static"]
 """What the data set shows: the images; what moves, cut out by alpha; or what stands still, with movers masked."""
 
 FILE = "transforms.json"
 POINTS = "points.ply"
+CLOCKWISE = np.array([[0.0, -1.0], [1.0, 0.0]])
+"""A quarter turn of a camera's axes, x to the right and y down."""
 
 
 class Pinhole(NamedTuple):
@@ -94,22 +97,40 @@ def undistort(
         keep: ``moving`` gives the images an alpha channel, which is 0 where the masks are white.
     """
     pinhole, x, y = pinhole_of(solved)
+
+    def undistorted(pixels: np.ndarray) -> np.ndarray:
+        return cv2.remap(pixels, x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+
     (folder / "images").mkdir(exist_ok=True)
     if frame_files.masks is not None:
         (folder / "masks").mkdir(exist_ok=True)
     for number in solved.places:
         name = frame_files.names[number]
-        image = cv2.remap(read_rgb(frame_files.folder / name), x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+        file = frame_files.folder / name
+        image, alpha = read_cut_out(file) if frame_files.cut_out else (read_rgb(file), None)
+        hidden = alpha is not None and alpha < HIDDEN
+        image, alpha = moved(image, alpha, undistorted)
         if frame_files.masks is not None:
             mask = read_rgb(frame_files.masks / name)
-            moved = cv2.remap(mask, x, y, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE)
-            write_png(folder / "masks" / name, moved)
+            mask[hidden] = 255  # Training may know that nothing is there.
+            write_png(
+                folder / "masks" / name, cv2.remap(mask, x, y, cv2.INTER_NEAREST, borderMode=cv2.BORDER_REPLICATE)
+            )
             if keep == "moving":
                 still = cv2.remap(mask[..., 0], x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-                image = np.dstack([image, 255 - still])
-        write_png(folder / "images" / name, image)
+                alpha = 255 - still if alpha is None else np.minimum(alpha, 255 - still)
+        write_png(folder / "images" / name, image if alpha is None else np.dstack([image, alpha]))
         done()
     return pinhole
+
+
+def as_held(viewmats: np.ndarray, turns: Sequence[int]) -> np.ndarray:
+    """Return the world-to-camera matrices [V, 4, 4] that pictures would have without their quarter turns,
+    counter-clockwise; all have none if ``turns`` is empty."""
+    held = viewmats.copy()
+    for view, count in zip(held, turns):
+        view[:2] = np.linalg.matrix_power(CLOCKWISE, count) @ view[:2]
+    return held
 
 
 def scene_of(
@@ -118,18 +139,23 @@ def scene_of(
     pinhole: Pinhole,
     seconds: Sequence[float],
     span: tuple[float, float],
+    turns: Sequence[int] = (),
 ) -> CapturedScene:
-    """Turn cameras and points upright, and map times from ``span`` (seconds of the video) to [0, 1]."""
-    moved = upright(solved.viewmats, solved.points)
+    """Turn cameras and points upright, and map times from ``span`` (seconds of the video) to [0, 1].
+
+    Args:
+        turns: number of quarter turns, counter-clockwise, by which each frame was turned; empty if none was.
+    """
+    placed = upright(as_held(solved.viewmats, [turns[number] for number in solved.places if turns]), solved.points)
     length = max(span[1] - span[0], 1e-9)
     chosen = [seconds[number] for number in solved.places]
     return CapturedScene(
         pinhole,
-        moved.viewmats(solved.viewmats),
+        placed.viewmats(solved.viewmats),
         [min(max((second - span[0]) / length, 0.0), 1.0) for second in chosen],
         chosen,
         [frame_files.names[number] for number in solved.places],
-        moved.points(solved.points),
+        placed.points(solved.points),
         solved.colors,
     )
 

@@ -294,12 +294,13 @@ def _decoded(path: Path, data: np.ndarray) -> np.ndarray:
     return cv2.cvtColor(pixels, code)
 
 
-def instead_of_image(start: bytes) -> str | None:
-    """Say what a file is that came in place of an image, by its first bytes; None for anything else."""
+def instead_of_image(start: bytes, what: str = "image") -> str | None:
+    """Say what a file is that came in place of an image, or of something else, by its first bytes; None for anything
+    else."""
     if start.startswith(b"version https://git-lfs.github.com"):
-        return "is a pointer of Git LFS, not an image; run 'git lfs pull' in its repository"
+        return f"is a pointer of Git LFS, not the {what}; run 'git lfs pull' in its repository"
     if any(mark in start.lower() for mark in (b"<!doctype html", b"<html")):
-        return "is a web page, not an image; download the image itself"
+        return f"is a web page, not the {what}; download the {what} itself"
     return None
 
 

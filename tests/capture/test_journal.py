@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 
 import pytest
 
@@ -62,6 +63,21 @@ def test_an_attempt_that_ended_before_its_first_entry_is_no_obstacle(tmp_path, m
         (tmp_path / name[0] / name).write_text("dear")
         with pytest.raises(UserError, match="something else"):
             start(tmp_path / name[0])
+
+
+def test_files_of_systems_are_no_obstacle(tmp_path):
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out/.DS_Store").write_bytes(b"x")
+    start(tmp_path / "out")
+    assert (tmp_path / "out/work/journal.json").is_file() and (tmp_path / "out/.DS_Store").read_bytes() == b"x"
+
+
+def test_a_finished_folder_whose_work_was_deleted_is_called_finished(tmp_path):
+    start(tmp_path / "out")
+    (tmp_path / "out/transforms.json").write_text("{}")
+    shutil.rmtree(tmp_path / "out/work")
+    with pytest.raises(UserError, match=r"out: exists and holds a finished data set; give another --output"):
+        start(tmp_path / "out")
 
 
 def test_two_captures_do_not_share_a_folder(tmp_path):

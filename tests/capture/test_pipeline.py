@@ -22,7 +22,7 @@ from helpers.films import cut_copy
 from helpers.full_disk import small_disk
 from helpers.paths import ROOT
 from helpers.room import Film, path_length, save, shoot
-from scgs_warp.capture import CaptureRequest, capture, mapping, pipeline
+from scgs_warp.capture import CaptureRequest, capture, mapping, picked_frames, pipeline
 from scgs_warp.capture.similarity import align, centres
 from scgs_warp.capture.source import open_source
 from scgs_warp.data import load
@@ -191,6 +191,41 @@ def test_the_mover_alone(filmed, captured, tmp_path):
         run(film, tmp_path / "nothing", masks=str(white), keep="moving", **OPTIONS)
 
 
+def test_images_that_are_cut_out_stay_so(filmed, tmp_path):
+    """What alpha hides is no part of the scene: here, a pattern that goes along with the camera."""
+    truth, _ = filmed
+    (tmp_path / "images").mkdir()
+    fixed = noise(0)[:120, :160].repeat(2, 0).repeat(2, 1)
+    alpha = np.full((240, 320, 1), 255, np.uint8)
+    alpha[:, :140] = 0
+    for index, frame in enumerate(truth.frames):
+        shown = np.where(alpha > 0, frame, fixed)
+        write_png(tmp_path / f"images/{index:03d}.png", np.dstack([shown, alpha]))
+    made = run(tmp_path / "images", tmp_path / "out", **OPTIONS)
+    assert any("cut out by alpha" in line for line in made.lines)
+    check_cameras(truth, tmp_path / "out")
+    data = load(tmp_path / "out")
+    assert data.with_alpha and data.points is not None and len(data.points) > 200
+    for frame in data:
+        assert not frame.alpha[:, :100].any() and frame.alpha[:, -100:].all()
+        assert not frame.image[:, :100].any(), "no colour of what is hidden"
+
+
+def test_black_bars_are_cut_off(filmed, tmp_path):
+    """Cameras are those of the film without them, and given masks are cut likewise."""
+    truth, _ = filmed
+    film = write_film(tmp_path / "bars.mp4", [np.pad(frame, ((40, 40), (0, 0), (0, 0))) for frame in truth.frames])
+    given = write_masks(tmp_path / "given", [np.pad(moving, ((40, 40), (0, 0))) for moving in truth.moving])
+    made = run(film, tmp_path / "out", masks=str(given), **OPTIONS)
+    assert any("black bars" in line for line in made.lines)
+    check_cameras(truth, tmp_path / "out")
+    data = load(tmp_path / "out")
+    assert data[0].image.shape[0] <= 240 and all(frame.mask is None for frame in data)
+    assert min(float(frame.image[[0, -1]].mean()) for frame in data) > 0.1
+    made = run(film, tmp_path / "out", masks=str(given), **OPTIONS)
+    assert made.made_before and any("black bars" in line for line in made.lines)
+
+
 def test_the_same_film_gives_the_same_bytes(filmed, captured, tmp_path):
     """Matching and mapping once more, in a copy."""
     again = tmp_path / "again"
@@ -227,7 +262,7 @@ def test_a_film_that_was_cut_off_is_said_to_be(tmp_path, filmed):
     made = [run(cut, out, masks="none", **OPTIONS) for _ in range(2)]
     assert [len(each.lines) for each in made] == [2, 2] and made[0].lines == made[1].lines
     assert re.match(rf"note: .*cut\.mp4: 1\d of {FRAMES} frames can be decoded, until second 1\.", made[0].lines[1])
-    assert pipeline._choose(CaptureRequest(cut, end=0.6), open_source(cut), silent).incomplete is None
+    assert picked_frames.choose(CaptureRequest(cut, end=0.6), open_source(cut), silent).incomplete is None
     cut_copy(filmed[1], cut, 0.3)
     with pytest.raises(UserError, match=rf"cut\.mp4: only \d of {FRAMES} frames can be decoded"):
         run(cut, tmp_path / "few")
@@ -256,6 +291,16 @@ def test_a_full_disk_is_said_and_work_goes_on(tmp_path):
         disk.free()
         with pytest.raises(UserError, match="0 of 7 frames registered"):
             run(tmp_path / "images", tmp_path / "disk/out", masks="none", features=64)
+
+
+def test_a_camera_that_stands_still(tmp_path, filmed):
+    frames = []
+    for index in range(10):
+        frames.append(filmed[0].frames[0].copy())
+        frames[-1][60:180, 25 * index : 25 * index + 80] = noise(0)[:120, :80]
+    film = write_film(tmp_path / "tripod.mp4", frames)
+    with pytest.raises(UserError, match=r"the camera stands still, .* film from several places"):
+        run(film, tmp_path / "out", features=800)
 
 
 def test_a_film_without_texture(tmp_path):

@@ -7,11 +7,12 @@ from fractions import Fraction
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from helpers.films import encoded, mask_images, pan, stream
 from scgs_warp.capture.folder_content import photographs_left_out
 from scgs_warp.capture.rig.instants import frame_seconds
-from scgs_warp.capture.source import DIGEST_BYTES, Folder, Video, open_source, rotate_image
+from scgs_warp.capture.source import DIGEST_BYTES, Folder, Video, open_source
 from scgs_warp.errors import UserError
 from scgs_warp.visualization.video import film, write_png
 
@@ -85,13 +86,6 @@ def test_a_film_that_changes_its_size_is_usable_up_to_there(tmp_path):
     assert len(list(Video(tmp_path / "call.h264").frames(200, range(22, 26)))) == 4, "other frames do not matter"
 
 
-def test_pictures_are_turned_as_they_were_held():
-    image = np.arange(24, dtype=np.uint8).reshape(2, 4, 3)
-    assert np.array_equal(rotate_image(image, 0), image)
-    assert np.array_equal(rotate_image(image, 90), np.rot90(image)), "counter-clockwise"
-    assert np.array_equal(rotate_image(image, -90.0), np.rot90(image, 3))
-
-
 def test_what_is_no_film_is_refused(tmp_path):
     (tmp_path / "film.mp4").write_bytes(b"not a film" * 1000)
     (tmp_path / "empty").mkdir()
@@ -111,6 +105,62 @@ def test_what_is_no_film_is_refused(tmp_path):
     (mixed / "010.png").write_bytes(b"x")
     with pytest.raises(UserError, match=r"010\.png: is not an image"):
         list(open_source(mixed).frames(64))
+
+
+def test_what_came_in_place_of_a_film_is_named(tmp_path):
+    for content, said in (
+        (
+            b"version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 9\n",
+            "is a pointer of Git LFS, not the video",
+        ),
+        (b"<!DOCTYPE html>\n<html>", "is a web page, not the video; download the video itself"),
+        (b"", "is empty; copy it again"),
+    ):
+        (tmp_path / "film.mp4").write_bytes(content)
+        with pytest.raises(UserError, match=rf"film\.mp4: {said}"):
+            open_source(tmp_path / "film.mp4")
+
+
+def photograph(path, sensor: np.ndarray, orientation: int) -> None:
+    """Write what a camera stores, with the orientation in which it was held."""
+    exif = Image.Exif()
+    exif[0x0112] = orientation
+    Image.fromarray(sensor).save(path, exif=exif, quality=95)
+
+
+@pytest.mark.parametrize("most", [6, 8, 1])
+def test_photographs_held_in_different_ways_have_one_lens(most, tmp_path):
+    """As the sensor saw them: a quarter turn more or less would move the lens off its centre."""
+    sensor = pan([0])[0]
+    turns = {1: 0, 3: 2, 6: 3, 8: 1}
+    for index, orientation in enumerate((most, 1, 6, 8, 3, most, most, most)):
+        photograph(tmp_path / f"{index}.jpg", sensor, orientation)
+    stills = list(Folder(tmp_path).frames(1000))
+    for still, orientation in zip(stills, (most, 1, 6, 8, 3, most, most, most)):
+        as_most = np.rot90(sensor, turns[most])
+        upright = (turns[orientation] - turns[most]) % 2 == 0  # of most photographs' sides
+        expected = np.rot90(sensor, turns[orientation]) if upright else as_most
+        assert still.image.shape == as_most.shape
+        assert np.abs(still.image.astype(int) - expected).mean() < 8, (orientation, most)
+        assert still.turns == (0 if upright else (turns[most] - turns[orientation]) % 4)
+
+
+def test_images_that_were_turned_before_have_one_size(tmp_path):
+    sensor = pan([0])[0]
+    for index in range(5):
+        write_png(tmp_path / f"{index}.png", sensor if index % 2 == 0 else np.rot90(sensor))
+    stills = list(Folder(tmp_path).frames(1000))
+    assert {still.image.shape for still in stills} == {(120, 160, 3)} and [s.turns for s in stills] == [0, 1, 0, 1, 0]
+
+
+def test_a_film_with_its_picture_beside_it_is_named(tmp_path):
+    write_png(tmp_path / "cover.png", np.zeros((8, 8, 3), np.uint8))
+    (tmp_path / "film.mp4").write_bytes(b"x")
+    with pytest.raises(UserError, match=r"holds 1 images, but film\.mp4; give \S+film\.mp4"):
+        Folder(tmp_path)
+    for index in range(5):
+        write_png(tmp_path / f"{index}.png", np.zeros((8, 8, 3), np.uint8))
+    assert Folder(tmp_path).count == 6
 
 
 def test_files_that_are_hidden_are_no_images(tmp_path):

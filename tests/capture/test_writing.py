@@ -57,3 +57,21 @@ def test_the_written_folder_is_read_back_with_identical_cameras(tmp_path, bend):
     for entry in train.entries:
         entry.camera.viewmat[:] = torch.from_numpy(to_dots.viewmats(entry.camera.viewmat.double().numpy()[None])[0])
     assert share_found(train, 0.1) > 0.75
+
+
+def test_turned_photographs_do_not_tilt_the_world(tmp_path):
+    """Half of them were held the other way; their cameras are turned about the optical axis."""
+    found = solved((90.0, 40.0, 30.0, 0.0))
+    shots = FrameFiles(tmp_path, [f"{index}.png" for index in range(10)], None)
+    pinhole = writing.Pinhole(90.0, 90.0, 40.0, 30.0, 80, 60)
+    seconds = [float(index) for index in range(10)]
+    level = writing.scene_of(shots, found, pinhole, seconds, (0.0, 9.0))
+    turns = [index % 4 for index in range(10)]
+    views = found.viewmats.copy()
+    for view, place in zip(views, found.places):
+        angle = -np.pi / 2 * turns[place]  # the axes of an image that was turned counter-clockwise
+        rotation = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
+        view[:2] = rotation @ view[:2]
+    scene = writing.scene_of(shots, found._replace(viewmats=views), pinhole, seconds, (0.0, 9.0), turns)
+    np.testing.assert_allclose(scene.points, level.points, atol=1e-9)
+    np.testing.assert_allclose(scene.viewmats[:, 2], level.viewmats[:, 2], atol=1e-9)

@@ -13,7 +13,7 @@ import numpy as np
 
 from fuzz.files_cases import Format, check_gaussians, check_numbers, expect, finite, named, within
 from helpers.edit_scenes import bar_scene
-from scgs_warp.capture import pipeline
+from scgs_warp.capture import CaptureRequest, picked_frames, pipeline
 from scgs_warp.capture.journal import Journal
 from scgs_warp.capture.rig.instants import frame_seconds
 from scgs_warp.capture.rig.sound import MAX_SECONDS as MAX_SOUND
@@ -90,7 +90,9 @@ def silent(total: int, text: str) -> Any:
 
 
 def _result() -> dict[str, Any]:
-    return pipeline.PickedFrames([0, 3, 5], [0.0, 0.3, 0.5], ["a", "b", "c"], (0.0, 1.0), (64, 48), 9, 1, 1)._asdict()
+    return picked_frames.PickedFrames(
+        [0, 3, 5], [0.0, 0.3, 0.5], ["a", "b", "c"], (0.0, 1.0), (64, 48), 9, 1, 1
+    )._asdict()
 
 
 def write_journal(folder: Path) -> None:
@@ -111,16 +113,16 @@ def load_journal(folder: Path) -> None:
 
 def _resume(journal: Journal) -> None:
     source = SimpleNamespace(count=9, video=True, path=Path("film.mp4"))
-    before, pipeline._choose = pipeline._choose, lambda *_: (_ for _ in ()).throw(_Again)  # type: ignore[assignment]
+    before, picked_frames.choose = picked_frames.choose, lambda *_: (_ for _ in ()).throw(_Again)  # type: ignore[assignment]
     try:
-        frames = pipeline._frames(pipeline.CaptureRequest(Path("film.mp4")), source, journal, silent)  # type: ignore[arg-type]
+        frames = picked_frames.pick_frames(CaptureRequest(Path("film.mp4")), source, journal, silent)  # type: ignore[arg-type]
         check_numbers(frames._asdict(), "frames")
         expect(len(frames.indices) == len(frames.seconds), "frames without a time")
         expect(all(name.endswith(".png") for name in frames.files), "names")
     except _Again:
         return
     finally:
-        pipeline._choose = before
+        picked_frames.choose = before
     journal.stage("masks", "auto", lambda: {"share": 0.0}, lambda: None)
     within("share", pipeline._share(journal), -1e300, 1e300)
 

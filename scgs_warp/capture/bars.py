@@ -1,0 +1,66 @@
+"""Black bars that editing programs and players put beside a film of other proportions. They are no part of the scene:
+trained, they would become black walls that go along with the camera."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from ..visualization.video import write_png
+from .source import read_rgb
+
+BLACK = 24
+"""Largest value of a channel in a bar; compression makes black uneven."""
+SHOWN = 0.8
+"""Least share of the pixels of the first line beside a bar that show something in the course of the film. A thing
+before a dark background has no such edge."""
+EDGE = 2
+"""Width of the blurred edge, pixels, which is cut off as well."""
+LEAST = 0.02
+"""Least width of a bar, as a share of the side. Narrower borders are left to training, which ignores them."""
+UNEVEN = 0.01
+"""Largest difference between opposite bars, as a share of the side: a film is in the middle of its bars."""
+
+
+class Bars(NamedTuple):
+    """Widths to cut off, pixels."""
+
+    top: int = 0
+    bottom: int = 0
+    left: int = 0
+    right: int = 0
+
+    def cut(self, image: np.ndarray) -> np.ndarray:
+        """Cut them off an image [H, W, ...]."""
+        height, width = image.shape[:2]
+        return image[self.top : height - self.bottom, self.left : width - self.right]
+
+
+def find_bars(brightest: np.ndarray) -> Bars:
+    """Find the bars by the brightest value [H, W] uint8 that each pixel has in the film."""
+    (top, bottom), (left, right) = _pair(brightest), _pair(brightest.T)
+    return Bars(top, bottom, left, right)
+
+
+def _pair(brightest: np.ndarray) -> tuple[int, int]:
+    """Return the widths of the bars above and below; zeros without them."""
+    bright = np.flatnonzero(brightest.max(1) > BLACK)
+    if not len(bright):
+        return 0, 0
+    height, first, last = len(brightest), int(bright[0]), int(bright[-1])
+    above, below = first, height - 1 - last
+    if min(above, below) < LEAST * height or abs(above - below) > max(2, UNEVEN * height):
+        return 0, 0
+    if last - first < 4 * EDGE:
+        return 0, 0
+    shown = (brightest[[first + EDGE, last - EDGE]] > BLACK).mean(1).min()
+    return (above + EDGE, below + EDGE) if shown >= SHOWN else (0, 0)
+
+
+def cut_off(folder: Path, names: Sequence[str], bars: Bars) -> None:
+    """Cut the bars off the images of these names."""
+    for name in names:
+        write_png(folder / name, bars.cut(read_rgb(folder / name)))
