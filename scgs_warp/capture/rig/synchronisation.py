@@ -109,6 +109,8 @@ def _lag(one: np.ndarray, two: np.ndarray, size: int, length_one: int, length_tw
         return 0.0, 0.0
     strength = np.where(possible, correlation, 0.0)
     peak = int(strength.argmax())
+    if min(length_one, length_two) < least or correlation.max() > strength[peak]:
+        return 0.0, 0.0  # they match where they have too little in common
     clarity = float(strength[peak] / max(np.sqrt(np.square(correlation[possible]).mean()), 1e-12))
     return (float(lags[peak]) + _vertex(correlation, peak)) / RATE, clarity
 

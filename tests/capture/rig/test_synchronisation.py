@@ -121,3 +121,16 @@ def test_a_film_without_sound_has_none(tmp_path):
     write_film(tmp_path / "mute.mp4", [np.zeros((64, 64, 3), np.uint8)] * 8, 10.0, 30, None)
     assert read_sound(tmp_path / "mute.mp4") is None
     assert SAMPLE_RATE == 48_000
+
+
+@pytest.mark.parametrize("kept", [0.7, 1.3])
+def test_films_that_have_less_than_a_second_in_common_are_not_guessed(tmp_path, kept):
+    """Where too little overlaps, another clap may look alike."""
+    starts = np.array([0.0, 0.6, 0.5, 0.65])
+    sounds = [read_sound(file) for file in record(tmp_path, starts)]
+    first = sounds[0]
+    assert first is not None
+    sounds[0] = first._replace(samples=first.samples[: round(kept * RATE)])
+    clock = synchronise(sounds)
+    assert np.isnan(clock.starts[0])
+    assert np.abs(clock.starts[1:] - (starts[1:] - 0.5)).max() < 0.002
