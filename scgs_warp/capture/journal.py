@@ -25,7 +25,7 @@ LOCK = ".lock"
 LEFT = re.compile(r"\.journal\.json\.\w+\.tmp|\.lock")
 """Names of what a killed writer of the journal leaves."""
 OF_SYSTEMS = (".DS_Store", "Thumbs.db", "desktop.ini", ".directory")
-NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EROFS)
+NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG)
 
 
 class Journal:

@@ -88,6 +88,8 @@ def _enough(request: CaptureRequest, frames: PickedFrames) -> None:
     if frames.seen < MIN_FRAMES:
         if frames.incomplete is not None:
             raise UserError(f"{request.source}: only {frames.incomplete.describe()}")
+        if frames.seen == 1 and request.source.is_file():
+            raise UserError(f"{request.source}: is a single picture; give a film, or a folder of images")
         raise UserError(f"{request.source}: {frames.seen} frames are too few; film a few seconds, or give more images")
     raise UserError(
         f"{request.source}: {len(frames.indices)} of {frames.seen} frames are neither blurred nor alike "

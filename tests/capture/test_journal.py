@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import errno
 import json
+import os
 import shutil
 
 import pytest
 
 from helpers.full_disk import FakeDisk
-from scgs_warp.capture.journal import Journal
+from scgs_warp.capture.journal import Journal, disk_errors
 from scgs_warp.errors import UserError
 
 
@@ -78,6 +80,11 @@ def test_a_finished_folder_whose_work_was_deleted_is_called_finished(tmp_path):
     shutil.rmtree(tmp_path / "out/work")
     with pytest.raises(UserError, match=r"out: exists and holds a finished data set; give another --output"):
         start(tmp_path / "out")
+
+
+def test_a_file_that_is_too_large_for_the_disk_is_said(tmp_path):
+    with pytest.raises(UserError, match=r"out: cannot be written \(File too large\)"), disk_errors(tmp_path / "out"):
+        raise OSError(errno.EFBIG, os.strerror(errno.EFBIG))
 
 
 def test_two_captures_do_not_share_a_folder(tmp_path):

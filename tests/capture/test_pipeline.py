@@ -315,6 +315,9 @@ def test_a_film_without_texture(tmp_path):
 def test_a_film_that_is_too_short_or_rests(tmp_path, filmed):
     with pytest.raises(UserError, match=r"three\.mp4: 3 frames are too few"):
         run(write_film(tmp_path / "three.mp4", filmed[0].frames[:3]), tmp_path / "a")
+    write_png(tmp_path / "one.png", filmed[0].frames[0])
+    with pytest.raises(UserError, match=r"one\.png: is a single picture; give a film, or a folder of images"):
+        run(tmp_path / "one.png", tmp_path / "one")
     with pytest.raises(UserError, match=r"1 of 12 frames are neither blurred nor alike.*11 alike"):
         run(write_film(tmp_path / "rest.mp4", [filmed[0].frames[0]] * 12), tmp_path / "b")
     with pytest.raises(UserError, match=r"--start 99"):
