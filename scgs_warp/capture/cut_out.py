@@ -9,6 +9,7 @@ import cv2
 import numpy as np
 
 from ..data.images import CUT_OUT, OPAQUE
+from .source_frame import shrunk
 
 HIDDEN = 128
 """Alpha below which a pixel shows nothing in which features are found."""
@@ -45,3 +46,11 @@ def moved(
 def resized(image: np.ndarray, alpha: np.ndarray | None, size: tuple[int, int]) -> tuple[np.ndarray, np.ndarray | None]:
     """Resize a picture to (width, height) by averaging."""
     return moved(image, alpha, lambda pixels: cv2.resize(pixels, size, interpolation=cv2.INTER_AREA))
+
+
+def reduced(image: np.ndarray, alpha: np.ndarray | None, longest: int) -> tuple[np.ndarray, np.ndarray | None]:
+    """Reduce a picture with alpha as ``shrunk`` does one without."""
+    if alpha is None:
+        return shrunk(image, longest), None
+    height, width = shrunk(image[..., 0], longest).shape
+    return resized(image, np.ascontiguousarray(alpha), (width, height))

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from ..geometry.optical_flow import at_targets, targets_of, textured
-from .source import shrunk
+from .source_frame import shrunk
 
 FLOW_SIDE = 480
 """Longer side of the images for optical flow, pixels."""

@@ -21,7 +21,8 @@ from .completeness import Incomplete
 from .cut_out import is_cut_out
 from .journal import Journal
 from .request import CaptureRequest
-from .source import Source, SourceFrame
+from .source import Source
+from .source_frame import SourceFrame
 
 MAX_SECONDS = 1e9
 """Largest plausible time in a film, seconds."""

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from .source import SourceFrame, shrunk
+from .source_frame import SourceFrame, shrunk
 
 SHARPNESS_SIDE = 640
 """Longer side of the images for measuring sharpness, pixels."""

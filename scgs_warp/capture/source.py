@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import hashlib
 from array import array
 from collections import Counter
-from collections.abc import Container, Iterator, Sequence
+from collections.abc import Container, Iterator
 from contextlib import suppress
 from functools import cached_property
 from itertools import islice, pairwise
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, Protocol
 
 import cv2
 import numpy as np
@@ -21,35 +20,19 @@ from ..data.orientation import TURNS, read_orientation, upright
 from ..errors import UserError
 from ..storage.files import open_regular
 from . import cut_out
+from .animation import Animation, is_animation
 from .as_shown import picture
 from .completeness import Incomplete, header_of, incomplete, lost_in_gaps
+from .digests import digest, digest_of_ends
 from .folder_content import images_in
 from .frame_times import REORDERED, rising
+from .source_frame import SourceFrame
 
-DIGEST_BYTES = 1 << 20
-"""Number of bytes of a file that are hashed at a time. Digests of earlier versions saw as many at both ends only."""
 LONGEST = 1000
 """Largest time that names of images tell, as a multiple of that of images without gaps."""
 OPAQUE_SUFFIXES = (".jpg", ".jpeg", ".bmp")
 SAMPLE = 100
 """Number of stored pictures that show whether they have times of display."""
-
-
-class SourceFrame(NamedTuple):
-    """One frame of a source."""
-
-    index: int
-    """Index in the video or in the order of names, from 0."""
-    seconds: float
-    """Time since the first frame, seconds; for a folder, in units of the usual time between two images."""
-    image: np.ndarray
-    """[H, W, 3] uint8 RGB"""
-    name: str
-    """Name of the image file; empty for a video."""
-    alpha: np.ndarray | None = None
-    """[H, W] uint8; None for a picture without alpha."""
-    turns: int = 0
-    """Number of quarter turns, counter-clockwise, by which the picture was turned to have the others' size."""
 
 
 class Source(Protocol):
@@ -87,7 +70,7 @@ def open_source(path: Path) -> Source:
         return Folder(path)
     if not path.is_file():
         raise UserError(f"{path}: no such file or folder; give a video, or a folder of images")
-    return Video(path)
+    return Animation(path) if is_animation(path) else Video(path)
 
 
 class Video:
@@ -161,7 +144,7 @@ class Video:
             raise UserError(f"{self.path}: only {self.incomplete.describe()}")
 
     def digest(self, earlier: bool = False) -> str:
-        return _digest_of_ends([self.path]) if earlier else _digest([self.path])
+        return digest_of_ends([self.path]) if earlier else digest([self.path])
 
 
 def _no_video(path: Path, error: Exception) -> str:
@@ -255,7 +238,7 @@ class Folder:
                     f"{file}: is {size_text(image.shape[1::-1])}, but {usual.name} is {size_text(size)}; "
                     "give images of one camera and one size"
                 )
-            image, alpha = _reduced(np.ascontiguousarray(image), alpha, longest)
+            image, alpha = cut_out.reduced(np.ascontiguousarray(image), alpha, longest)
             yield SourceFrame(index, self.moments[index], image, file.name, alpha, turns)
 
     @cached_property
@@ -266,8 +249,8 @@ class Folder:
 
     def digest(self, earlier: bool = False) -> str:
         if earlier:
-            return _digest_of_ends(self.files)
-        return _digest(self.files, [file.name for file in self.files])
+            return digest_of_ends(self.files)
+        return digest(self.files, [file.name for file in self.files])
 
 
 def turns_of(file: Path) -> int:
@@ -331,45 +314,3 @@ def _bytes_of(file: Path) -> np.ndarray:
         return np.fromfile(file, np.uint8)
     except OSError as error:
         raise UserError(f"{file}: cannot be read ({error.strerror}); make the file readable") from None
-
-
-def _reduced(image: np.ndarray, alpha: np.ndarray | None, longest: int) -> tuple[np.ndarray, np.ndarray | None]:
-    """Reduce a picture with alpha as ``shrunk`` does one without."""
-    if alpha is None:
-        return shrunk(image, longest), None
-    height, width = shrunk(image[..., 0], longest).shape
-    return cut_out.resized(image, np.ascontiguousarray(alpha), (width, height))
-
-
-def shrunk(image: np.ndarray, longest: int) -> np.ndarray:
-    """Reduce the image, if necessary, so that its longer side has at most ``longest`` pixels."""
-    scale = longest / max(image.shape[:2])
-    if scale >= 1:
-        return image
-    size = (max(1, round(image.shape[1] * scale)), max(1, round(image.shape[0] * scale)))
-    return cv2.resize(image, size, interpolation=cv2.INTER_AREA)
-
-
-def _digest(files: list[Path], names: Sequence[str] = ()) -> str:
-    """Hash the content of files, and names, which tell times; dates do not matter."""
-    digest = hashlib.sha256("/".join(names).encode())  # no name has a slash
-    for file in files:
-        digest.update(f"/{file.stat().st_size},".encode())
-        with file.open("rb") as content:
-            while part := content.read(DIGEST_BYTES):
-                digest.update(part)
-    return digest.hexdigest()
-
-
-def _digest_of_ends(files: list[Path]) -> str:
-    """Hash the sizes and both ends of the files, as earlier versions did."""
-    digest = hashlib.sha256()
-    for file in files:
-        size = file.stat().st_size
-        digest.update(f"{size},".encode())
-        with file.open("rb") as content:
-            digest.update(content.read(DIGEST_BYTES))
-            if size > DIGEST_BYTES:
-                content.seek(max(DIGEST_BYTES, size - DIGEST_BYTES))
-                digest.update(content.read(DIGEST_BYTES))
-    return digest.hexdigest()

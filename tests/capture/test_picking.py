@@ -10,7 +10,7 @@ import pytest
 
 from helpers.films import pan, wall
 from scgs_warp.capture import picking
-from scgs_warp.capture.source import SourceFrame
+from scgs_warp.capture.source_frame import SourceFrame
 
 
 def measured(frames: list[np.ndarray], fps: float = 30) -> picking.FrameMeasures:

@@ -10,9 +10,10 @@ import pytest
 from PIL import Image
 
 from helpers.films import encoded, mask_images, pan, stream
+from scgs_warp.capture.digests import DIGEST_BYTES
 from scgs_warp.capture.folder_content import photographs_left_out
 from scgs_warp.capture.rig.instants import frame_seconds
-from scgs_warp.capture.source import DIGEST_BYTES, Folder, Video, open_source
+from scgs_warp.capture.source import Folder, Video, open_source
 from scgs_warp.errors import UserError
 from scgs_warp.visualization.video import film, write_png
 
@@ -151,6 +152,26 @@ def test_images_that_were_turned_before_have_one_size(tmp_path):
         write_png(tmp_path / f"{index}.png", sensor if index % 2 == 0 else np.rot90(sensor))
     stills = list(Folder(tmp_path).frames(1000))
     assert {still.image.shape for still in stills} == {(120, 160, 3)} and [s.turns for s in stills] == [0, 1, 0, 1, 0]
+
+
+def test_animated_images_are_films(tmp_path):
+    pictures = pan(range(0, 60, 3))
+    first, *others = [Image.fromarray(picture) for picture in pictures]
+    for name, options in (("a.webp", {"lossless": True}), ("a.png", {}), ("still.webp", None)):
+        more = {} if options is None else {"save_all": True, "append_images": others, "duration": 80, **options}
+        first.save(tmp_path / name, **more)
+    for name in ("a.webp", "a.png"):
+        source = open_source(tmp_path / name)
+        stills = list(source.frames(80))
+        assert source.video and len(stills) == 20 and (source.count == 20 or name == "a.png")
+        np.testing.assert_allclose([still.seconds for still in stills], 0.08 * np.arange(20), atol=0.011)
+        assert stills[-1].image.shape == (60, 80, 3) and stills[0].alpha is None
+    (still,) = open_source(tmp_path / "still.webp").frames(1000)
+    assert still.image.shape == (120, 160, 3)
+    content = (tmp_path / "a.webp").read_bytes()
+    (tmp_path / "cut.webp").write_bytes(content[: len(content) // 2])
+    with pytest.raises(UserError, match=r"cut\.webp: is not an animation that decodes"):
+        list(open_source(tmp_path / "cut.webp").frames(80))
 
 
 def test_a_film_with_its_picture_beside_it_is_named(tmp_path):

@@ -14,7 +14,7 @@ import numpy as np
 
 from ...data.dataset import spread
 from ..moving import sampson
-from ..source import shrunk
+from ..source_frame import shrunk
 
 SIDE = 960
 """Longer side of the images that are compared, pixels."""

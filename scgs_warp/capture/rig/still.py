@@ -12,7 +12,7 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 
-from ..source import shrunk
+from ..source_frame import shrunk
 
 MOST_MOMENTS = 24
 """Number of moments from which the median is taken."""
