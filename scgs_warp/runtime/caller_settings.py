@@ -6,7 +6,7 @@ import contextlib
 import functools
 import sys
 from collections.abc import Callable, Iterator
-from typing import ParamSpec, TypeVar
+from typing import ParamSpec, TypeVar, cast
 
 import torch
 
@@ -28,7 +28,7 @@ def unaffected(function: Callable[Parameters, Result]) -> Callable[Parameters, R
         run = function
         if "torch._dynamo" in sys.modules:  # importing the compiler takes a second
             if not eager:
-                eager.append(torch.compiler.disable(function))
+                eager.append(cast("Callable[Parameters, Result]", torch.compiler.disable(function)))
             run = eager[0]
         if _as_usual():
             return run(*args, **kwargs)
