@@ -20,7 +20,6 @@ from ..geometry.view_rays import pixels_of, ray_of
 from ..runtime.progress import progress
 from ..runtime.search_tree import search_tree
 from ..seeding import generator
-from ..types import Camera
 from .depth import Depths, FrameDepths, SeenDepth
 from .flow import Flows
 from .flow_points import LEAST_REGION, InstantPoints, colors_at, strays
@@ -45,21 +44,19 @@ UNSURE = 0.3
 MAJORITY = 0.5
 """Least weighted share of the pixels that decide together that must move."""
 FEWEST, ENOUGH = 50, 0.4
-"""Least number of a moment's points: as a number, and as a share of the largest number of any moment."""
+"""Least number of a moment's moving pixels: as a number, and as a share of the median number. A mover that goes away
+covers fewer and fewer."""
 GHOST = 3.0
 """Distance to a moving point, in distances between neighbouring ones, up to which a sparse point lies on what moves."""
 
 
-def depth_clouds(
-    count: int, data: Dataset, views: list[Camera], depths: Depths, seed: int, key: int
-) -> list[InstantPoints]:
+def depth_clouds(count: int, data: Dataset, flows: Flows, depths: Depths, seed: int, key: int) -> list[InstantPoints]:
     """Find up to ``count`` moving points at each of several moments; moments without enough are left out.
 
     Args:
-        views: normalised cameras of the frames, on the host.
         key: of the random choice.
     """
-    flows, found = Flows(data, views), []
+    found = []
     ordered = sorted(data.with_depth, key=lambda index: data.entries[index].time)
     chosen = [ordered[each] for each in spread(len(ordered), MOST_MOMENTS)]
     later: list[Tensor | None] = []
@@ -67,8 +64,9 @@ def depth_clouds(
         for index in chosen:
             found.append(_cloud(index, count, data, flows, depths, seed, key))
             bar.advance()
-        least = max(float(FEWEST), ENOUGH * max((each.count for each in found), default=0))
-        kept = [each for each in found if each.count >= least]
+        moving = [number for _, number in found if number >= FEWEST]
+        least = max(FEWEST, ENOUGH * float(np.median(moving or [0])))
+        kept = [each for each, number in found if number >= least]
         for one, two in itertools.pairwise(kept):
             later.append(later_places(one, two.index, flows, depths))
             bar.advance()
@@ -80,15 +78,14 @@ class FramePoints(NamedTuple):
     """The moving points of a frame."""
 
     index: int
-    pixels: np.ndarray
-    """[P, 2] where they are seen, at the size of the flow."""
-    count: int
-    """Number of moving pixels, of which the cloud may hold some only."""
     cloud: InstantPoints
+    """With the pixels."""
 
 
-def _cloud(index: int, count: int, data: Dataset, flows: Flows, depths: Depths, seed: int, key: int) -> FramePoints:
-    """Find the moving points of a frame, up to ``count`` of them, chosen at random."""
+def _cloud(
+    index: int, count: int, data: Dataset, flows: Flows, depths: Depths, seed: int, key: int
+) -> tuple[FramePoints, int]:
+    """Find the moving points of a frame, up to ``count`` of them, chosen at random; and the number of all."""
     seen = depths.of(index)
     assert seen is not None, "asked for frames with a depth map only"
     inverse = seen.inverse.numpy()
@@ -98,8 +95,15 @@ def _cloud(index: int, count: int, data: Dataset, flows: Flows, depths: Depths, 
     every = moves.nonzero()[0]
     kept = every[torch.randperm(len(every), generator=generator(seed, key, index))[:count].numpy()]
     colors = colors_at(data[index].image, pixels[kept], (inverse.shape[1], inverse.shape[0]))
-    found = torch.from_numpy(points[kept]).float(), colors, torch.ones(len(kept), dtype=torch.bool)
-    return FramePoints(index, pixels[kept], len(every), InstantPoints(*found, data.entries[index].time))
+    cloud = seen_points(index, points[kept], colors, data.entries[index].time, pixels[kept])
+    return FramePoints(index, cloud), len(every)
+
+
+def seen_points(index: int, points: np.ndarray, colors: Tensor, time: float, pixels: np.ndarray) -> InstantPoints:
+    """Return moving points [P, 3] that a frame sees at pixels [P, 2]."""
+    frames, moves = torch.full((len(points),), index), torch.ones(len(points), dtype=torch.bool)
+    found = torch.from_numpy(points).float(), colors, moves, time
+    return InstantPoints(*found, frames=frames, pixels=torch.from_numpy(pixels))
 
 
 def points_of(seen: SeenDepth) -> tuple[np.ndarray, np.ndarray]:
@@ -107,10 +111,10 @@ def points_of(seen: SeenDepth) -> tuple[np.ndarray, np.ndarray]:
     inverse = seen.inverse.numpy()
     rows, columns = np.nonzero(inverse > 0)
     pixels = np.stack([columns, rows], 1).astype(np.float64)
-    return pixels, _placed(seen, pixels, inverse[rows, columns])
+    return pixels, placed(seen, pixels, inverse[rows, columns])
 
 
-def _placed(seen: SeenDepth, pixels: np.ndarray, inverse: np.ndarray) -> np.ndarray:
+def placed(seen: SeenDepth, pixels: np.ndarray, inverse: np.ndarray) -> np.ndarray:
     """Return the points [P, 3] at pixels [P, 2] with inverse depths [P]."""
     start, directions = ray_of(seen.camera, pixels)
     along = directions @ seen.camera.viewmat[2, :3].double().numpy()
@@ -120,18 +124,20 @@ def _placed(seen: SeenDepth, pixels: np.ndarray, inverse: np.ndarray) -> np.ndar
 def later_places(one: FramePoints, following: int, flows: Flows, depths: FrameDepths) -> Tensor:
     """Return where the points of a frame are in a later one, [P, 3]: at the depth of the pixel to which flow leads; NaN
     where flow or depth is not known."""
-    there = np.full((len(one.pixels), 3), np.nan)
+    assert one.cloud.pixels is not None, "seen by a frame"
+    pixels = one.cloud.pixels.numpy()
+    there = np.full((len(pixels), 3), np.nan)
     path, seen = flows.between_frames(one.index, following), depths.of(following)
     if path is None or seen is None:
         return torch.from_numpy(there).float()
     vectors, certain = flows.along(path)
-    columns, rows = one.pixels.astype(int).T
+    columns, rows = pixels.astype(int).T
     targets = targets_of(vectors)[rows, columns].astype(np.float64)
     x, y = targets.round().astype(int).T
     height, width = seen.inverse.shape
     inverse = seen.inverse.numpy()[y.clip(0, height - 1), x.clip(0, width - 1)]
     known = certain[rows, columns] & (inverse > 0) & (x >= 0) & (y >= 0) & (x < width) & (y < height)
-    there[known] = _placed(seen, targets[known], inverse[known])
+    there[known] = placed(seen, targets[known], inverse[known])
     return torch.from_numpy(there).float()
 
 

@@ -197,6 +197,11 @@ def flow_size(width: int, height: int) -> tuple[int, int]:
     return max(1, round(width * factor)), max(1, round(height * factor))
 
 
+def gray_at(frame: Frame, size: tuple[int, int]) -> np.ndarray:
+    """Return a frame in grey, [h, w] uint8, reduced to (width, height)."""
+    return cv2.resize(_gray(frame), size, interpolation=cv2.INTER_AREA)
+
+
 def _gray(frame: Frame) -> np.ndarray:
     """Return a frame in grey, [h, w] uint8, at most ``FLOW_SIDE`` pixels wide and high."""
     levels = (frame.image.clamp(0.0, 1.0) * 255.0).round().to(torch.uint8).contiguous().numpy()

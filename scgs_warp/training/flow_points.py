@@ -67,6 +67,10 @@ class InstantPoints(NamedTuple):
     time: float
     later: Tensor | None = None
     """[P, 3] where the points are at the time of the following cloud of a film; NaN where that is not known."""
+    frames: Tensor | None = None
+    """[P] int64, the frame in which each point is seen."""
+    pixels: Tensor | None = None
+    """[P, 2] where, at the size of the flow."""
 
 
 def flow_points(count: int, known: Tensor, data: Dataset, views: list[Camera]) -> InstantPoints | None:

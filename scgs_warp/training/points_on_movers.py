@@ -15,6 +15,7 @@ from .depth import Depths
 from .depth_points import depth_clouds, on_movers
 from .flow import Flows, follow_each_other
 from .flow_points import InstantPoints, flow_points
+from .registration import Registration
 from .start_motion import SeenMotion, start_cloud
 from .stereo_depth import StereoDepths, stereo_depths
 from .stereo_points import moving_points, stereo_clouds
@@ -54,8 +55,9 @@ def points_on_movers(
     stereo = stereo_depths(data, normalisation)
     if stereo is not None:
         most = min(most, int(SHARE * count))
-        clouds = stereo_clouds(stereo, Flows(data, views), most, seed, Purpose.MOVING_POINTS)
-        found, motion = _gathered(clouds, most, seed)
+        flows = Flows(data, views)
+        clouds = stereo_clouds(stereo, flows, most, seed, Purpose.MOVING_POINTS)
+        found, motion = _gathered(clouds, most, seed, Registration(data, flows, stereo, stereo.frame_then))
         if found is not None:
             keep = _kept(known, torch.from_numpy(~moving_points(known.double().numpy(), stereo.standing)))
     elif (data.with_depth or len(known) < count) and follow_each_other(data):
@@ -80,14 +82,19 @@ def _by_depth(
     """Find up to ``most`` points, and what depth maps show of their motion; None if nothing moves."""
     depths = Depths(data, views, scale)
     depths.read()
-    clouds = depth_clouds(most, data, views, depths, seed, Purpose.MOVING_POINTS)
-    return _gathered(clouds, most, seed)
+    flows = Flows(data, views)
+    clouds = depth_clouds(most, data, flows, depths, seed, Purpose.MOVING_POINTS)
+    frames = {cloud.time: int(cloud.frames[0]) for cloud in clouds if cloud.frames is not None}
+    registration = Registration(data, flows, depths, lambda _, time: frames.get(time))
+    return _gathered(clouds, most, seed, registration)
 
 
-def _gathered(clouds: list[InstantPoints], most: int, seed: int) -> tuple[InstantPoints | None, SeenMotion | None]:
+def _gathered(
+    clouds: list[InstantPoints], most: int, seed: int, registration: Registration
+) -> tuple[InstantPoints | None, SeenMotion | None]:
     """Gather the points of all clouds in the rest pose, up to ``most``; None if nothing moves."""
     if not clouds:
         return None, None
     start = [cloud.time for cloud in clouds].index(start_cloud(clouds).time)
-    found, tracks = gather(clouds, start, most, seed, Purpose.MOVING_POINTS)
+    found, tracks = gather(clouds, start, most, seed, Purpose.MOVING_POINTS, registration)
     return found, None if found is None else SeenMotion(found, clouds, tracks)

@@ -95,6 +95,11 @@ class StereoDepths:
         """Return True for a frame whose images were matched at its own moment, so that movers have depth."""
         return index in self._matched
 
+    def frame_then(self, index: int, time: float) -> int | None:
+        """Return the frame of the same camera nearest to a time; None if its movers have no depth."""
+        other = self.frames_at(time).get(self._camera_of[index])
+        return other if other is not None and self.matches(other) else None
+
     def size(self, number: int) -> tuple[int, int]:
         """Return width and height of the depth of a camera's frames."""
         camera = self.standing[number].camera

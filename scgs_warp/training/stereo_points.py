@@ -15,7 +15,7 @@ import torch
 from ..data.dataset import spread
 from ..runtime.progress import progress
 from ..seeding import generator
-from .depth_points import FramePoints, later_places, points_of
+from .depth_points import FramePoints, later_places, points_of, seen_points
 from .flow import Flows
 from .flow_points import InstantPoints, colors_at, strays
 from .standing_cameras import StandingCamera
@@ -60,7 +60,7 @@ def stereo_clouds(stereo: StereoDepths, flows: Flows, count: int, seed: int, key
         for time in stereo.moments:
             found.append(_moment(time, stereo, count, seed, key))
             bar.advance()
-        sizes = [sum(each.count for each in moment.values()) for moment in found]
+        sizes = [sum(len(each.cloud.points) for each in moment.values()) for moment in found]
         least = max(float(FEWEST), ENOUGH * max(sizes, default=0))
         kept = [(time, moment) for time, moment, size in zip(stereo.moments, found, sizes) if size >= least]
         clouds = []
@@ -117,21 +117,20 @@ def _moment(time: float, stereo: StereoDepths, count: int, seed: int, key: int) 
     found = {}
     for number, index in here.items():
         own = chosen & (owners == index)
-        places, at = torch.from_numpy(every[own]).float(), np.concatenate(pixels)[own]
+        at = np.concatenate(pixels)[own]
         colors = colors_at(stereo.data[index].image, at, stereo.size(number))
-        cloud = InstantPoints(places, colors, torch.ones(len(places), dtype=torch.bool), time)
-        found[number] = FramePoints(index, at, len(places), cloud)
+        found[number] = FramePoints(index, seen_points(index, every[own], colors, time, at))
     return found
 
 
 def _joined(moment: dict[int, FramePoints], time: float) -> InstantPoints:
     parts = [each.cloud for each in moment.values()]
-    points, colors, moves = (torch.cat(each) for each in zip(*(part[:3] for part in parts)))
-    return InstantPoints(points, colors, moves, time)
+    names = "points", "colors", "moves", "frames", "pixels"
+    return InstantPoints(**{name: torch.cat([getattr(part, name) for part in parts]) for name in names}, time=time)
 
 
 def _later(one: FramePoints, two: FramePoints | None, flows: Flows, stereo: StereoDepths) -> torch.Tensor:
     """Return where the points of a frame are in its camera's frame of the next moment, [P, 3]; NaN where unknown."""
-    if two is None or two.index == one.index or not len(one.pixels):
+    if two is None or two.index == one.index or not len(one.cloud.points):
         return torch.full_like(one.cloud.points, torch.nan)
     return later_places(one, two.index, flows, stereo)

@@ -7,6 +7,8 @@ visible ones nearest to it, as a rigid body.
 
 from __future__ import annotations
 
+import functools
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -16,6 +18,7 @@ from torch import Tensor
 from ..runtime.search_tree import search_tree
 from ..seeding import generator
 from .flow_points import InstantPoints
+from .registration import Registration
 
 AROUND = 16
 """Number of tracked points that carry a point."""
@@ -29,6 +32,8 @@ LEAST_SURE = 0.15
 """Least weight in the pose of the first cloud with which a point of another is taken there."""
 STILL = 1.0
 """Least distance, in units of ``NEAR``, that a point must go. Those that go less do not move after all."""
+SURE_AGAIN = 0.9
+"""Largest weight of a place near those that an image shows."""
 FRESH = 2.0
 """Least distance to the points taken before, in distances between neighbouring points of the first cloud."""
 
@@ -51,13 +56,19 @@ class Tracks(NamedTuple):
 
 
 def gather(
-    clouds: list[InstantPoints], start: int, count: int, seed: int, key: int
+    clouds: list[InstantPoints],
+    start: int,
+    count: int,
+    seed: int,
+    key: int,
+    registration: Registration | None = None,
 ) -> tuple[InstantPoints | None, Tracks | None]:
     """Carry the points of all clouds to the pose of cloud ``start``, so that surfaces hidden then are there, too.
 
     Args:
         count: largest number of points.
         key: of the random choice.
+        registration: finds points in images far away in time.
 
     Returns:
         The points of the cloud and those of others that lie beside them, the nearest in time first; and their tracks,
@@ -66,14 +77,19 @@ def gather(
     first = clouds[start]
     middle = first.points.median(0).values
     unit = NEAR * max(float((first.points - middle).norm(dim=1).median()), 1e-6)
-    tracks = follow(first.points, start, clouds, unit)
+
+    def followed(number: int) -> Tracks | None:
+        seen = None if registration is None else functools.partial(registration.places, clouds[number])
+        return follow(clouds[number].points, number, clouds, unit, seen)
+
+    tracks = followed(start)
     if tracks is None:
         return first, None
     own = first.points.double().numpy()
     spacing = FRESH * float(np.median(search_tree(own).query(own, k=2)[0][:, 1]))
     points, colors, places, weights = [first.points], [first.colors], [tracks.places], [tracks.weights]
     for number in sorted(range(len(clouds)), key=lambda each: abs(each - start))[1:]:
-        found = follow(clouds[number].points, number, clouds, unit)
+        found = followed(number)
         assert found is not None, "some cloud has tracks"
         there = found.places[start].double().numpy()
         apart = search_tree(torch.cat(points).double().numpy()).query(there)[0]
@@ -97,11 +113,18 @@ def gather(
     return everywhere, tracks.of(some)
 
 
-def follow(points: Tensor, start: int, clouds: list[InstantPoints], unit: float) -> Tracks | None:
+def follow(
+    points: Tensor,
+    start: int,
+    clouds: list[InstantPoints],
+    unit: float,
+    seen: Callable[[float, np.ndarray], np.ndarray] | None = None,
+) -> Tracks | None:
     """Follow points [P, 3] of cloud ``start`` through all clouds; None if no cloud has tracks.
 
     Args:
         unit: distance to the tracked points around at which a step is half as sure.
+        seen: returns where images show the points at a time, [P, 3], given the expected places; NaN where none does.
     """
     if all(cloud.later is None for cloud in clouds):
         return None
@@ -116,9 +139,11 @@ def follow(points: Tensor, start: int, clouds: list[InstantPoints], unit: float)
                 break
             here, there = pairs if ahead else pairs[::-1]
             following = number + numbers.step
-            moved, sure = _carried(places[number].numpy(), here, there, unit)
-            places[following] = torch.from_numpy(moved)
-            weights[following] = weights[number] * torch.from_numpy(sure)
+            moved, near = _carried(places[number].numpy(), here, there, unit)
+            sure = weights[number].numpy() * near
+            if seen is not None:
+                moved, sure = _corrected(moved, sure, seen(clouds[following].time, moved), unit)
+            places[following], weights[following] = torch.from_numpy(moved), torch.from_numpy(sure)
     return Tracks(places.float(), weights.float())
 
 
@@ -128,7 +153,22 @@ def _pairs(cloud: InstantPoints) -> tuple[np.ndarray, np.ndarray] | None:
     if cloud.later is None:
         return None
     known = cloud.later.isfinite().all(1)
-    here, there = cloud.points[known].double().numpy(), cloud.later[known].double().numpy()
+    return _agreeing(cloud.points[known].double().numpy(), cloud.later[known].double().numpy())
+
+
+def _corrected(expected: np.ndarray, sure: np.ndarray, seen: np.ndarray, unit: float) -> tuple[np.ndarray, np.ndarray]:
+    """Move expected places [P, 3] as the places that images show, those farther from these less; return how sure they
+    are then, [P]."""
+    known = np.isfinite(seen).all(1)
+    pairs = _agreeing(expected[known], seen[known])
+    if pairs is None:
+        return expected, sure
+    moved, again = _carried(expected, *pairs, unit)
+    return expected + again[:, None] * (moved - expected), np.maximum(sure, SURE_AGAIN * again)
+
+
+def _agreeing(here: np.ndarray, there: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+    """Return points and where they are later, each [Q, 3], without outliers; None if there are too few."""
     if len(here) < FEWEST:
         return None
     moves = there - here

@@ -14,9 +14,11 @@ from helpers.tiny import tiny_config
 from scgs_warp.data.dataset import Dataset
 from scgs_warp.geometry.normalisation import Normalisation
 from scgs_warp.rendering.render import render
+from scgs_warp.training import depth_points
 from scgs_warp.training import points_on_movers as module
 from scgs_warp.training.depth import Depths
 from scgs_warp.training.depth_points import GHOST, depth_clouds, on_movers
+from scgs_warp.training.flow import Flows
 from scgs_warp.training.flow_points import InstantPoints
 from scgs_warp.training.points_on_movers import points_on_movers
 from scgs_warp.training.state import TrainState
@@ -48,7 +50,7 @@ def film() -> Dataset:
 def clouds_of(data: Dataset, count: int = 500) -> tuple[list[InstantPoints], Normalisation]:
     normalisation = Normalisation.fit(data.cameras, data.points)
     views = [normalisation.apply_camera(camera) for camera in data.cameras]
-    return depth_clouds(count, data, views, Depths(data, views, normalisation.scale), 0, 1), normalisation
+    return depth_clouds(count, data, Flows(data, views), Depths(data, views, normalisation.scale), 0, 1), normalisation
 
 
 def test_clouds_lie_on_the_ball_at_every_moment(film):
@@ -73,6 +75,16 @@ def test_points_are_followed_to_the_next_moment(film):
         errors = (there - here - moved).norm(dim=1) / moved.norm()
         assert float(known.float().mean()) > 0.5 and float(errors.median()) < 0.5, one.time
     assert clouds[-1].later is None
+
+
+def test_a_mover_that_goes_away_is_found_at_every_moment(film, monkeypatch):
+    """It covers fewer and fewer pixels."""
+    numbers = iter([*range(1000, 0, -40), 0, 0])
+    found = depth_points._cloud
+    monkeypatch.setattr(depth_points, "_cloud", lambda *arguments: (found(*arguments)[0], next(numbers)))
+    moments = [cloud.time for cloud in clouds_of(film)[0]]
+    assert moments == [entry.time for entry in film.entries][: len(moments)]
+    assert len(moments) == 20, "those with 40 % of 520, the median"
 
 
 def test_colours_are_those_of_the_image(film):
@@ -111,7 +123,7 @@ def test_the_same_points_every_time_and_others_with_another_seed(film):
     assert all(torch.equal(a.points, b.points) for a, b in zip(one, two, strict=True))
     normalisation = Normalisation.fit(film.cameras, film.points)
     views = [normalisation.apply_camera(camera) for camera in film.cameras]
-    other = depth_clouds(100, film, views, Depths(film, views, normalisation.scale), 1, 1)
+    other = depth_clouds(100, film, Flows(film, views), Depths(film, views, normalisation.scale), 1, 1)
     assert not torch.equal(one[0].points, other[0].points)
 
 
