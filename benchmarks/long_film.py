@@ -111,7 +111,7 @@ def visit(data: Path, cache_mib: int, bounded: bool) -> Row:
         frames.silhouettes.room = 2**40
     before = peak_mib("cpu")
     for index in range(len(frames)):
-        frames.view(index, 0, random_background=True, sought=True)
+        frames.load(index, 0, random_background=True, sought=True)
     peak = peak_mib("cpu")
     assert before is not None and peak is not None
     kept = {"bounded": bounded, "cache_mib": mib, "images_mib": round(train.cache.used / 2**20, 1)}

@@ -174,7 +174,7 @@ class Frames:
         if (self, index) not in self.data.cache and not any(self.images.hold((index, half)) for half in (False, True)):
             self.data.expect(index)
 
-    def view(self, index: int, step: int, random_background: bool, sought: bool, view: int = 0) -> Loaded:
+    def load(self, index: int, step: int, random_background: bool, sought: bool, view: int = 0) -> Loaded:
         """Load the images of this step's ``view``. A file whose images are on the device is not read.
 
         Args:

@@ -117,7 +117,7 @@ def prepare(state: TrainState, frames: Frames, view: int = 0) -> View:
     progressive = config.pretrain.progressive and pretraining
     index = frames.index_at(step, progressive, view)
     random_background = varies_background(state)
-    loaded = frames.view(index, state.step, random_background, seeks_silhouettes(state), view)
+    loaded = frames.load(index, state.step, random_background, seeks_silhouettes(state), view)
     later, next_view = divmod(view + (1 if state.group is None else state.group.size), config.batch)
     frames.expect(step + later, progressive, next_view)
     time = noisy_time(frames.data.entries[index].time, state, len(frames), view)

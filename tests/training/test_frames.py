@@ -46,19 +46,19 @@ def test_progressive_by_fifths_adds_them_at_once():
 
 def test_random_background_is_under_the_image_alone():
     made = frames()
-    _, background, truth, mask, _ = made.view(3, 7, True, False)
-    alpha, plain = made.data[3].alpha, made.view(3, 7, False, False).truth
+    _, background, truth, mask, _ = made.load(3, 7, True, False)
+    alpha, plain = made.data[3].alpha, made.load(3, 7, False, False).truth
     assert mask is None
     assert torch.allclose(truth, plain + (1 - alpha) * background[:, None, None])
-    assert torch.equal(truth, made.view(3, 7, True, False).truth), "the same step gives the same background"
-    assert not torch.equal(truth, made.view(3, 8, True, False).truth)
+    assert torch.equal(truth, made.load(3, 7, True, False).truth), "the same step gives the same background"
+    assert not torch.equal(truth, made.load(3, 8, True, False).truth)
 
 
 @pytest.mark.parametrize("size", [64, 65])
 def test_half_size_sees_the_same_scene(size):
     made = frames(size, half_size=10)
-    camera, _, truth, _, _ = made.view(2, 9, False, False)
-    whole_camera, _, whole, _, _ = made.view(2, 10, False, False)
+    camera, _, truth, _, _ = made.load(2, 9, False, False)
+    whole_camera, _, whole, _, _ = made.load(2, 10, False, False)
     assert truth.shape == (3, size // 2, size // 2) and whole.shape == (3, size, size)
     assert (camera.width, camera.height) == (size // 2, size // 2)
     even = whole[:, : size // 2 * 2, : size // 2 * 2]
@@ -72,13 +72,13 @@ def test_half_size_sees_the_same_scene(size):
 
 def test_small_images_and_masks_at_half_size():
     made = frames(48, half_size=10)
-    assert made.view(0, 0, False, False).camera.width == 48, "too small to be halved"
+    assert made.load(0, 0, False, False).camera.width == 48, "too small to be halved"
     made = frames(64, half_size=10)
     mask = torch.ones(64, 64, dtype=torch.bool)
     mask[10, 11] = False
     masked = [dataclasses.replace(frame, mask=mask if index == 1 else None) for index, frame in enumerate(made.data)]
     made.data = Dataset(masked, folder=made.data.folder, split="train")
-    half = made.view(1, 0, False, False).mask
+    half = made.load(1, 0, False, False).mask
     assert half is not None and not half[5, 5] and int((~half).sum()) == 1
 
 
@@ -88,11 +88,11 @@ def test_random_backgrounds_over_data_on_white():
     on_white = [dataclasses.replace(f, image=f.image + (1 - f.alpha)[..., None]) for f in given]
     data = Dataset(on_white, folder=given.folder, split="train", background="white")
     made = Frames(data, Normalisation.identity(), tiny_config(100), "cpu")
-    _, background, truth, _, _ = made.view(1, 7, True, False)
+    _, background, truth, _, _ = made.load(1, 7, True, False)
     alone = given[1].image.permute(2, 0, 1)
     expected = alone + (1 - given[1].alpha) * background[:, None, None]
     assert torch.allclose(truth, expected, atol=1e-6) and not torch.allclose(background, torch.ones(3))
-    assert torch.equal(made.view(1, 7, False, False).background, torch.ones(3))
+    assert torch.equal(made.load(1, 7, False, False).background, torch.ones(3))
 
 
 def test_random_data_has_another_background_at_every_step():
@@ -100,7 +100,7 @@ def test_random_data_has_another_background_at_every_step():
     made = frames()
     data = Dataset(list(made.data), folder=made.data.folder, split="train", background="random")
     made = Frames(data, Normalisation.identity(), tiny_config(100), "cpu")
-    seen = [made.view(3, step, False, False) for step in (7, 8)]
+    seen = [made.load(3, step, False, False) for step in (7, 8)]
     for view in seen:
         expected = data[3].image.permute(2, 0, 1) + (1 - data[3].alpha) * view.background[:, None, None]
         assert torch.allclose(view.truth, expected, atol=1e-6) and float(view.background.std()) > 1e-3
