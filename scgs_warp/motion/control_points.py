@@ -33,7 +33,7 @@ from .rigidity import (
     graph_state,
     rigidity,
 )
-from .tensor_states import Layers, TensorState, same_states, states_of
+from .tensor_states import NetworkModules, TensorState, same_states, states_of
 
 WITHIN_REACH = 0.999
 """Share of the pairs of a Gaussian and one of its control points that are no farther apart than a turn's reach."""
@@ -129,7 +129,7 @@ class ControlPoints(Motion):
         self._cached_for: list[TensorState] | None = None
         self._search = NeighborSearch()
         self._kept: tuple[PoseTrack, list[TensorState]] | None = None
-        self._layers: Layers | None = None
+        self._network_modules: NetworkModules | None = None
 
     def __len__(self) -> int:
         return self.positions.shape[0]
@@ -259,10 +259,10 @@ class ControlPoints(Motion):
 
     def _motion_state(self) -> list[TensorState]:
         """Identify the parameters of :meth:`poses`. Walking over all modules would take as long as interpolating."""
-        network = self.network
-        if self._layers is None or self._layers.network is not network or not self._layers.hold():
-            self._layers = Layers(network)
-        return states_of([self.positions, self.log_radii, *self._layers.parameters()])
+        known = self._network_modules
+        if known is None or known.network is not self.network or not known.hold():
+            known = self._network_modules = NetworkModules(self.network)
+        return states_of([self.positions, self.log_radii, *known.parameters()])
 
     def pose_at(self, time: float | Tensor) -> Pose:
         """Return the pose at a time in [0, 1]: interpolated if poses are kept and the host knows the time."""

@@ -19,7 +19,7 @@ def same_states(before: list[TensorState], now: list[TensorState]) -> bool:
     return len(before) == len(now) and all(a[0] is b[0] and a[1:] == b[1:] for a, b in zip(before, now))
 
 
-class Layers:
+class NetworkModules:
     """The modules of a network, found once."""
 
     def __init__(self, network: nn.Module) -> None:
