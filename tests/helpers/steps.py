@@ -9,11 +9,14 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import torch
+from torch import Tensor
 
 from helpers.tiny import tiny_config, tiny_dataset
 from scgs_warp.config.presets import TrainConfig
 from scgs_warp.data.dataset import Dataset
 from scgs_warp.runtime import environment
+from scgs_warp.storage import checkpoint
 from scgs_warp.training.frames import Frames
 from scgs_warp.training.loop import PlainSteps, fit
 from scgs_warp.training.recorded_step import RecordedSteps
@@ -70,3 +73,25 @@ def check_same_bits(
     fit(saving, data, output=folder / "crashed", device=device, resume=True)
     assert (folder / "crashed" / "checkpoint.safetensors").read_bytes() == results["two"]
     return folder / "two" / "checkpoint.safetensors"
+
+
+def check_resumed(
+    config: TrainConfig, data: Dataset, folder: Path, device: str, monkeypatch: pytest.MonkeyPatch, step: int
+) -> dict[str, Tensor]:
+    """Assert that a run that is saved and stopped before a step, and resumed, gives the same tensors as a whole one.
+    Return them."""
+    whole, parts = folder / "whole", folder / "parts"
+    fit(config, data, output=whole, device=device)
+
+    def interrupt(state: TrainState) -> None:
+        if state.step == step:
+            state.save(parts)
+            raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        before_each_step(patch, interrupt)
+        fit(config, data, output=parts, device=device)
+    fit(config, data, output=parts, device=device, resume=True)
+    tensors, resumed = (checkpoint.read(run)[0] for run in (whole, parts))
+    assert tensors.keys() == resumed.keys() and all(torch.equal(tensors[name], resumed[name]) for name in tensors)
+    return tensors

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from helpers.steps import before_each_step
+from helpers.steps import check_resumed
 from helpers.tiny import blobs, tiny_camera, tiny_config, tiny_dataset
 from scgs_warp.config.fields import LossConfig
 from scgs_warp.data.dataset import Dataset
@@ -135,20 +135,8 @@ def test_off_by_default_and_without_trace(tmp_path):
     assert not any("frame_colors" in name or "exposure" in name for name in read(tmp_path / "run")[0])
 
 
-def test_resumed_to_the_same_bits(tmp_path, device, monkeypatch):
+def test_a_run_resumes_to_the_same_bits(tmp_path, device, monkeypatch):
     data = tiny_dataset(6)
     config = tiny_config(40, optim={"frame_colors": 1e-2})
-    fit(config, data, output=tmp_path / "whole", device=device)
-
-    def interrupt(state):
-        if state.step == 25:
-            state.save(tmp_path / "parts")
-            raise KeyboardInterrupt
-
-    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
-        before_each_step(patch, interrupt)
-        fit(config, data, output=tmp_path / "parts", device=device)
-    fit(config, data, output=tmp_path / "parts", device=device, resume=True)
-    whole, parts = (read(tmp_path / name)[0] for name in ("whole", "parts"))
+    whole = check_resumed(config, data, tmp_path, device, monkeypatch, 25)
     assert whole["frame_colors.offsets"].any() and "adam.exposure.offsets.exp_avg" in whole
-    assert whole.keys() == parts.keys() and all(torch.equal(whole[name], parts[name]) for name in whole)
