@@ -64,14 +64,14 @@ def compare(results: list[Tensor], truth: list[Tensor], names: list[str]) -> Rep
 def agreement(call: Call) -> Report:
     """Compare images, gradients and moving frames of the device with the CPU's.
 
-    On a CPU its fastest form of compositing is compared with the readable pixel form.
+    On a CPU its fastest form of compositing is compared with the readable plain form.
     """
     s = call.setting
     count, size = next(iter(s.scenes.values()))
     leaves, reference = (leaves_of(count, size, device) for device in (s.device, "cpu"))
     report: Report = {}
     for sharpness in (0.0, SHARPNESS):
-        truth = drawn(reference, "pixel" if s.device == "cpu" else "auto", sharpness)
+        truth = drawn(reference, "plain" if s.device == "cpu" else "auto", sharpness)
         report[f"sharpness {sharpness}"] = compare(
             drawn(leaves, "auto", sharpness), truth, list(leaves.gaussians.tensors())
         )

@@ -151,7 +151,7 @@ def steps_in_turns(arap: bool, count: int, size: tuple[int, int], s: Setting) ->
 
 
 def forms(call: Call) -> Report:
-    """Compare every form of compositing on the device with the readable pixel form, and time it."""
+    """Compare every form of compositing on the device with the readable plain form, and time it."""
     s = call.setting
     names = ("cuda", "blocks") if s.device == "cuda" else ("cpu",)
     report: Report = {"passed": True}
@@ -162,7 +162,7 @@ def forms(call: Call) -> Report:
         if count > SLOWEST_FORM:
             continue
         for sharpness in (0.0, SHARPNESS):
-            truth = drawn(leaves, "pixel", sharpness)
+            truth = drawn(leaves, "plain", sharpness)
             for form in names:
                 row = compare(drawn(leaves, form, sharpness), truth, list(leaves.gaussians.tensors()))
                 report[f"{scene}/{form}"].update({"sharp": row} if sharpness else row)

@@ -22,7 +22,7 @@ from .binning import bin_window
 from .memory_windows import Demand, Window, slot_bytes
 from .shapes import check_shapes
 
-Form = Literal["auto", "pixel", "cpu", "cuda", "blocks"]
+Form = Literal["auto", "plain", "cpu", "cuda", "blocks"]
 EMPTY_TILE = 8
 """Cost of reading and writing a tile's pixels on a CPU, as the number of pairs of splat and tile that cost the same."""
 
@@ -88,7 +88,7 @@ def composite(
             ``means2d``.
         depth_unit: if given, the last channel is depth: of its blend, divided by alpha (at least 1e-10) and by this
             unit, the result is the expected depth. Without gradients alone.
-        form: kernels to run; ``auto`` takes the fastest for the device. ``pixel`` is the readable reference on any
+        form: kernels to run; ``auto`` takes the fastest for the device. ``plain`` is the readable reference on any
             device, ``blocks`` the portable sibling of ``cuda``.
 
     Returns:
@@ -163,12 +163,12 @@ class _Composite(torch.autograd.Function):
 
 
 def _resolve_form(form: str, device: torch.device, tile_size: int) -> str:
-    if form not in ("auto", "pixel", "cpu", "cuda", "blocks"):
-        raise ValueError(f"form must be auto, pixel, cpu, cuda or blocks, got {form!r}")
+    if form not in ("auto", "plain", "cpu", "cuda", "blocks"):
+        raise ValueError(f"form must be auto, plain, cpu, cuda or blocks, got {form!r}")
     if form == "auto":
         form = "cuda" if device.type == "cuda" else "cpu"
-        return form if tile_size == TILE_SIZE else "pixel"
-    if form != "pixel" and tile_size != TILE_SIZE:
+        return form if tile_size == TILE_SIZE else "plain"
+    if form != "plain" and tile_size != TILE_SIZE:
         raise ValueError(f"form {form} needs tiles of {TILE_SIZE} pixels, got tile_size {tile_size}")
     if form == "cpu" and device.type != "cpu":
         raise ValueError(f"form cpu needs tensors on the CPU, got {device}")
@@ -237,7 +237,7 @@ def _draw(
         launch(cpu_kernels.composite, count, *lists, *size, unit, *outputs, grain=1, load=load, begin=begin)
         return
     lists = (means2d, conics, source, channels, background, tiles.ranges, tiles.splats)
-    if form != "pixel":
+    if form != "plain":
         compositing_cuda.forward(form, lists, size, outputs, window)
         return
     for first, pixels in _pixels(tiles, window):
@@ -308,7 +308,7 @@ def _adjoint(
     if job.form == "cpu":
         rest, load = (*size, int(absolute), v_slots), _load(tiles, window)
         launch(cpu_kernels.composite_adjoint, count, source, *lists, *rest, grain=1, load=load, begin=begin)
-    elif job.form == "pixel":
+    elif job.form == "plain":
         rest = (*size, tiles.tile_size, int(absolute), v_slots)
         lists = (means2d, conics, source, channels, *lists)
         launch(kernels.composite_adjoint, count, *lists, *rest, grain=1, begin=begin)

@@ -17,7 +17,7 @@ from ..kernels.types import SSIM_BAND
 from ..runtime import launch
 from .ssim_cuda import PhotometricTiles
 
-Form = Literal["auto", "pixel", "cpu", "cuda"]
+Form = Literal["auto", "plain", "cpu", "cuda"]
 
 
 def ssim(image: Tensor, truth: Tensor, mask: Tensor | None = None, *, form: Form = "auto") -> Tensor:
@@ -28,7 +28,7 @@ def ssim(image: Tensor, truth: Tensor, mask: Tensor | None = None, *, form: Form
         truth: [C, H, W] float32, a constant: no gradient reaches it.
         mask: [H, W] bool, True for valid pixels. None: all are valid. Invalid pixels of ``image`` are replaced by those
             of ``truth`` so that they do not affect neighbouring windows, and they are left out of the mean.
-        form: kernels to run: ``pixel`` on any device, ``cpu`` in SIMD, ``cuda`` on a GPU; ``auto`` takes the fastest
+        form: kernels to run: ``plain`` on any device, ``cpu`` in SIMD, ``cuda`` on a GPU; ``auto`` takes the fastest
             for the device.
 
     Returns:
@@ -88,8 +88,8 @@ def photometric_loss(
 
 def _resolve_form(form: str, device: torch.device) -> str:
     """Return the form to run on a device."""
-    if form not in ("auto", "pixel", "cpu", "cuda"):
-        raise ValueError(f"form must be auto, pixel, cpu or cuda, got {form!r}")
+    if form not in ("auto", "plain", "cpu", "cuda"):
+        raise ValueError(f"form must be auto, plain, cpu or cuda, got {form!r}")
     if form == "auto":
         return "cuda" if device.type == "cuda" else "cpu"
     if form == "cpu" and device.type != "cpu":

@@ -178,7 +178,7 @@ def case_compositing(d: Draw, device: str) -> None:
         d.poison(channels, d.rows(count))
     if d.chance(0.2):
         d.poison(background)
-    form = "cuda" if device != "cpu" else d.pick(("cpu", "cpu", "pixel"))
+    form = "cuda" if device != "cpu" else d.pick(("cpu", "cpu", "plain"))
     check_composite(d, splats, channels.to(device), background.to(device), form)
 
 

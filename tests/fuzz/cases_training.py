@@ -49,7 +49,7 @@ def case_loss(d: Draw, device: str, form: Form | None = None) -> None:
     clean, hit = image.clone(), d.rows(channels * height * width)
     d.poison(image.view(-1), hit)
     image[(image.abs() > LARGEST_PIXEL) & image.isfinite()] = 0.25
-    form = form or ("pixel" if d.chance(0.3) else "auto")
+    form = form or ("plain" if d.chance(0.3) else "auto")
     weight = float(d.pick((0.0, 0.2, 1.0)))
     own = leaf(image.to(device))
     loss, l1, similarity = photometric_loss(own, truth.to(device), None, weight, form=form)

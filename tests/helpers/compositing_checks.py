@@ -16,7 +16,7 @@ NAMES = ("means2d", "conics", "opacities", "channels", "background")
 
 
 def forms(device: str) -> list[str]:
-    return ["pixel", "cpu"] if device == "cpu" else ["pixel", "cuda"]
+    return ["plain", "cpu"] if device == "cpu" else ["plain", "cuda"]
 
 
 def random_channels(seed: int, n: int, c: int, device: str = "cpu") -> Tensor:

@@ -70,8 +70,8 @@ def run_form(case: str, form: str, device: str) -> list[torch.Tensor]:
 
 
 def largest_differences(case: str, form: str, device: str) -> list[float]:
-    """Per result of ``run_form``, the largest difference to the pixel form, relative to the largest value."""
-    theirs, ours = run_form(case, "pixel", device), run_form(case, form, device)
+    """Per result of ``run_form``, the largest difference to the plain form, relative to the largest value."""
+    theirs, ours = run_form(case, "plain", device), run_form(case, form, device)
     differences = []
     for a, b in zip(theirs, ours):
         assert a.shape == b.shape and torch.isfinite(b).all(), (case, a, b)

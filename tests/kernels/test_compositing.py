@@ -120,7 +120,7 @@ def test_sums_of_slots_have_the_same_bits(n: int, c: int, absolute: bool, more: 
     shapes = ((n, 2), (n, 3), (n,), (n, c), (n, 2))
     before = [torch.randn(shape, generator=generator) for shape in shapes]
     results = []
-    for form in ("cpu", "pixel"):
+    for form in ("cpu", "plain"):
         outputs = [tensor.clone() for tensor in before]
         wanted = (*outputs[:4], outputs[4] if absolute else None)
         compositing_cuda.sum_slots(form, offsets, slots, wanted, more=more)

@@ -35,7 +35,7 @@ def _pair(shape: tuple[int, ...], seed: int) -> tuple[torch.Tensor, torch.Tensor
 
 
 def _forms(device: str) -> list[str]:
-    return ["pixel", "cpu" if device == "cpu" else "cuda"]
+    return ["plain", "cpu" if device == "cpu" else "cuda"]
 
 
 def _compare(image, truth, mask, weight, device, form, log_weight=0.0):

@@ -130,7 +130,7 @@ def draw(splats: Splats, form: str, channels: int = 3, gradients: bool = True) -
 
 
 @pytest.mark.parametrize("channels", (3, 4, 11))
-@pytest.mark.parametrize("form", ("auto", "pixel"))
+@pytest.mark.parametrize("form", ("auto", "plain"))
 def test_same_bits_in_windows_of_any_size(device: str, form: str, channels: int, monkeypatch: pytest.MonkeyPatch):
     splats = some_splats(2, device)
     whole = draw(splats, form, channels)

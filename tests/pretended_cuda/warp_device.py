@@ -80,15 +80,15 @@ def install(native: Path) -> None:
             sort(keys, values, count, bits)
 
     radix.radix_sort = sorted_on_device
-    for op, portable in ((compositing, "pixel"), (harmonics, "plain"), (ssim, "pixel")):
-        op._resolve_form = _portable_on_demand(op._resolve_form, portable)
+    for op in (compositing, harmonics, ssim):
+        op._resolve_form = _portable_on_demand(op._resolve_form)
     compositing_cuda.launch_native = _native(compositing_cuda.launch_native, native)
 
 
-def _portable_on_demand(resolve: Callable[..., str], portable: str) -> Callable[..., str]:
+def _portable_on_demand(resolve: Callable[..., str]) -> Callable[..., str]:
     def resolve_form(form: str, *args: Any) -> str:
         found = resolve(form, *args)
-        return portable if found == "cuda" and form == "auto" and not native_bodies else found
+        return "plain" if found == "cuda" and form == "auto" and not native_bodies else found
 
     return resolve_form
 

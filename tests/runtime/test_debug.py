@@ -57,7 +57,7 @@ def draw(splats: Splats, form: str, channels: int = 4) -> list[torch.Tensor]:
     return [image.detach(), alpha.detach(), means.grad, colors.grad]
 
 
-@pytest.mark.parametrize("form", ("auto", "pixel"))
+@pytest.mark.parametrize("form", ("auto", "plain"))
 @pytest.mark.parametrize("how", ({}, {"log_scale": 3.0, "aspect": 1.5}, {"log_scale": -1.0}, {"opacity": (0.9, 1.0)}))
 def test_random_scenes_keep_every_promise(device: str, form: str, how: dict, debugging: None):
     for seed in range(4):

@@ -56,7 +56,7 @@ def test_too_little_room_is_reported_and_stays_in_bounds(device: str, capacity: 
     if slots:
         assert 0 <= int(tiles.slots.min()) and int(tiles.slots.max()) < capacity
         assert int(tiles.offsets.max()) == capacity
-    image, alpha = composite(splats, torch.ones(300, 3, device=device), tiles, form="pixel")
+    image, alpha = composite(splats, torch.ones(300, 3, device=device), tiles, form="plain")
     assert torch.isfinite(image).all() and torch.isfinite(alpha).all()
 
 

@@ -1,4 +1,4 @@
-"""The block forms of compositing against the pixel form, on CUDA where there is one; else the portable one on the CPU's
+"""The block forms of compositing against the plain form, on CUDA where there is one; else the portable one on the CPU's
 block emulation (the native one: ``test_compositing_native``).
 
 The emulation is a setting of the process that must be made before a kernel is compiled, so it runs in one of its own.
@@ -46,9 +46,9 @@ def test_same_as_the_pixel_form(case, differences):
 
 def test_the_cases_contain_what_they_are_for():
     """Enough splats in a tile for several batches, and pixels that stop early in the opaque case."""
-    _, alpha, *_ = run_form("several batches and early stop", "pixel", "cpu")
+    _, alpha, *_ = run_form("several batches and early stop", "plain", "cpu")
     assert (alpha > 0.99).float().mean() > 0.5
-    image, _, *gradients = run_form("faint, several batches", "pixel", "cpu")
+    image, _, *gradients = run_form("faint, several batches", "plain", "cpu")
     assert image.shape == (1, 9, 16)
     assert (gradients[0] != 0).any(1).sum() > 256
 

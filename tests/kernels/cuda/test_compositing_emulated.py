@@ -1,4 +1,4 @@
-"""The native CUDA form of compositing, run on the CPU by a shim, against the pixel form: images, gradients, bits."""
+"""The native CUDA form of compositing, run on the CPU by a shim, against the plain form: images, gradients, bits."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def library(tmp_path_factory: pytest.TempPathFactory) -> ctypes.CDLL:
 
 def emulate(monkeypatch: pytest.MonkeyPatch, library: ctypes.CDLL, seed: int = 0) -> None:
     """Native launches go to the shim; those of the portable form, which the native one leaves many channels to, to the
-    pixel form."""
+    plain form."""
 
     def portable(kernel: Any, blocks: int, *args: Any, block_dim: int, begin: int = 0) -> None:
         assert kernel.key == "composite_adjoint"

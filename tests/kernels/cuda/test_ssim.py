@@ -1,4 +1,4 @@
-"""The native CUDA form of the photometric loss, run on the CPU by a shim, against the pixel form; its bits and sums."""
+"""The native CUDA form of the photometric loss, run on the CPU by a shim, against the plain form; its bits and sums."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def test_same_as_the_pixel_form(width: int, height: int, masked: bool, library: 
     monkeypatch.setattr(compositing_cuda, "launch_native", launcher(library))
     image, truth, mask = pair(2, height, width)
     arguments = image, truth, mask if masked else None
-    for got, expected in zip(run("cuda", *arguments), run("pixel", *arguments)):
+    for got, expected in zip(run("cuda", *arguments), run("plain", *arguments)):
         scale = float(expected.abs().max())
         torch.testing.assert_close(got, expected, rtol=1e-4, atol=2e-5 * scale + 1e-9)
 
@@ -114,5 +114,5 @@ def test_the_form_needs_a_gpu():
     image, truth, _ = pair(1, 20, 20)
     with pytest.raises(RuntimeError, match="needs a GPU"):
         photometric_loss(image, truth, form="cuda")
-    with pytest.raises(ValueError, match="form must be auto, pixel, cpu or cuda, got 'tiles'"):
+    with pytest.raises(ValueError, match="form must be auto, plain, cpu or cuda, got 'tiles'"):
         photometric_loss(image, truth, form="tiles")  # type: ignore[arg-type]
