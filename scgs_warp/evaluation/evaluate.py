@@ -18,6 +18,7 @@ from ..data import Dataset
 from ..errors import UserError
 from ..scene.frame_colors import FrameColors, apply_color, fitted_color
 from ..scene.scene import Scene
+from ..storage.checkpoint import DISK_FULL
 from ..types import Frame
 from ..visualization.figures import contact_sheet, to_bytes
 from ..visualization.video import write_png
@@ -128,7 +129,9 @@ class _Renders:
         try:
             write_png(path, image)
         except OSError as error:
-            raise UserError(f"{path}: cannot be written ({error.strerror}); free space there") from None
+            full = error.errno in DISK_FULL
+            remedy = "free space there" if full else "copy the run to a folder that can be written"
+            raise UserError(f"{path}: cannot be written ({error.strerror}); {remedy}") from None
 
 
 def distinct_names(names: list[str]) -> list[str]:

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import errno
 import json
 import math
+import os
 from pathlib import Path
 
 import cv2
@@ -158,6 +160,20 @@ def test_nowhere_to_write_is_told(tmp_path: Path) -> None:
         evaluate(scene, fake_dataset(scene, 1), render_dir=tmp_path / "file" / "renders")
     with pytest.raises(UserError, match="cannot be written"):
         write_metrics({}, tmp_path / "file" / "metrics.json")
+
+
+@pytest.mark.parametrize(
+    ("number", "remedy"),
+    [(errno.ENOSPC, "free space there"), (errno.EROFS, "copy the run to a folder that can be written")],
+)
+def test_what_helps_depends_on_why_nothing_can_be_written(tmp_path, monkeypatch, number, remedy) -> None:
+    def refuse(path: Path, image: object) -> None:
+        raise OSError(number, os.strerror(number), str(path))
+
+    monkeypatch.setattr("scgs_warp.evaluation.evaluate.write_png", refuse)
+    scene = FakeScene()
+    with pytest.raises(UserError, match=rf"r_000\.png: cannot be written .*; {remedy}$"):
+        evaluate(scene, fake_dataset(scene, 1), render_dir=tmp_path)
 
 
 def test_metrics_keep_the_contract(tmp_path: Path) -> None:
