@@ -42,7 +42,7 @@ def read_json(path: Path, needed: str = "restore it") -> dict[str, Any]:
     except OSError as error:
         raise UserError(f"{path}: cannot be read ({error.strerror}); restore the file") from None
     except UnicodeDecodeError:
-        raise UserError(f"{path}: is no UTF-8 text; restore the file") from None
+        raise UserError(f"{path}: is no UTF-8 text; save it as UTF-8, or restore it") from None
     try:
         content = parse_json(text)
     except json.JSONDecodeError as error:

@@ -10,6 +10,7 @@ from __future__ import annotations
 import os
 import re
 import stat
+from collections.abc import Sequence
 from pathlib import Path
 
 from ..errors import UserError
@@ -60,6 +61,13 @@ def in_any_case(file: Path) -> Path | None:
     except OSError:
         return None
     return file.with_name(found[0]) if found and file.with_name(found[0]).is_file() else None
+
+
+def first_there(files: Sequence[Path]) -> Path | None:
+    """Return the first of the files that exists or, without any, of those whose names differ only in upper and lower
+    case."""
+    exact = next((file for file in files if file.is_file()), None)
+    return exact or next((found for file in files if (found := in_any_case(file)) is not None), None)
 
 
 def is_regular(path: Path) -> bool:

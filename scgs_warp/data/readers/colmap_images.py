@@ -123,7 +123,7 @@ def _listing(folder: Path) -> dict[str, str]:
 def _in_order(folder: Path, names: Sequence[str]) -> list[Path]:
     """Return the files of a folder in the order of the names, which LLFF's reduced images (``image000.png``) keep; an
     empty list if there are more of them, or fewer."""
-    files = sorted(folder / name for name in os.listdir(folder) if name.lower().endswith(SUFFIXES))
+    files = sorted(folder / name for name in os.listdir(folder) if name.lower().endswith(SUFFIXES) and name[0] != ".")
     if len(files) != len(names):
         return []
     ordered = sorted(range(len(names)), key=lambda index: names[index])

@@ -24,6 +24,7 @@ from ...errors import UserError
 from ...geometry.rotation import is_rotation
 from ...storage.json_files import as_array, as_number, read_json
 from ...storage.numpy_files import read_npy
+from ...storage.safe_paths import first_there
 from ..assemble import FrameRecord, assemble, with_points
 from ..choice import choose
 from ..dataset import Dataset
@@ -32,9 +33,9 @@ from ..held_out import held_out
 from ..images import ReadOptions, size_text
 from ..lens import Lens, make_lens
 from . import dycheck
+from .transforms import SUFFIXES
 
 FILE = "dataset.json"
-SUFFIXES = (".png", ".jpg", ".jpeg")
 
 
 class World(NamedTuple):
@@ -177,7 +178,7 @@ def _of_split(listing: Listing, chosen: list[str], split: str, chosen_cameras: b
 def _image(folder: Path, name: str) -> Path:
     """Return the image of an id."""
     candidates = [folder / f"{name}{suffix}" for suffix in SUFFIXES]
-    return next((file for file in candidates if file.is_file()), candidates[0])
+    return first_there(candidates) or candidates[0]
 
 
 def _times(path: Path, names: list[str]) -> tuple[list[float], list[str]]:
@@ -246,8 +247,9 @@ def _viewmat(path: Path, content: dict[str, Any], world: World) -> np.ndarray:
 
 
 def _lens(path: Path, content: dict[str, Any], ratio: int, source: tuple[int, int]) -> Lens:
-    """Return the lens at the size of the images, which is the camera's image size divided by ``ratio``."""
-    size = as_array(content.get("image_size"), (2,))
+    """Return the lens at the size of the images, which is the camera's image size divided by ``ratio``. A camera that
+    states no size has that of the images."""
+    size = as_array(content.get("image_size", [ratio * side for side in source]), (2,))
     if size is None or (size < 1).any():
         raise UserError(f"{path}: image_size is not two positive numbers; give width and height in pixels")
     if (np.abs(size / ratio - source) > 1.0).any():

@@ -227,9 +227,9 @@ def _points(
 ) -> tuple[np.ndarray | None, np.ndarray | None]:
     """Read points [P, 3] in the frame of the poses, less ``offset``, and their colours [P, 3]; None without points."""
     name = content.get("ply_file_path")
-    if name is None:
+    if name is None or name == "":
         return None, None
-    if not isinstance(name, str) or not name:
+    if not isinstance(name, str):
         raise UserError(f"{path}: ply_file_path is not text; name the file of points or leave it out")
     points, colors = read_points(inside(folder, name, f"{path}: ply_file_path"))
     applied = _applied(path, content, points)

@@ -18,7 +18,7 @@ from ...errors import UserError
 from ...geometry.rotation import is_rotation
 from ...storage.json_files import as_array, as_number, read_json
 from ...storage.numpy_files import read_npy
-from ...storage.safe_paths import inside
+from ...storage.safe_paths import first_there, inside
 from ..assemble import FrameRecord, assemble, with_points
 from ..choice import choose
 from ..dataset import Dataset
@@ -63,6 +63,7 @@ def read(folder: Path, split: str, options: ReadOptions) -> Dataset:
             if K is None or K[0, 0] <= 0 or K[1, 1] <= 0 or np.abs(K[2] - (0, 0, 1)).max() > 1e-6:
                 raise UserError(f"{path}: k{where} is not a 3 x 3 matrix of intrinsics in pixels; correct the camera")
             file = inside(folder / "ims", name, f"{path}: fn{where}", "image")
+            file = first_there([file]) or file
             pose = np.vstack([viewmat[:3], (0.0, 0.0, 0.0, 1.0)])
             label = Path(name).with_suffix("").as_posix().replace("/", "_").strip("._")
             records.append(FrameRecord(file, pose, instant / last, partial(_lens, path, content, K), label))

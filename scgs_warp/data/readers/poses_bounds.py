@@ -8,6 +8,7 @@ et al., LLFF, 2019; Li et al., Neural 3D Video Synthesis, CVPR 2022.
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -57,7 +58,7 @@ def read(folder: Path, split: str, options: ReadOptions) -> Dataset:
     """
     path = folder / FILE
     rows = read_rows(path)
-    cameras = _cameras(folder)
+    cameras, notes = _of_rig(folder, _cameras(folder), len(rows))
     if len(cameras) != len(rows):
         raise UserError(
             f"{path}: has {len(rows)} rows, but {folder} holds {len(cameras)} folders of images "
@@ -85,7 +86,7 @@ def read(folder: Path, split: str, options: ReadOptions) -> Dataset:
             )
     choice = choose(path, [r.file for r in records], [r.time for r in records], options)
     frames = [replace(records[index], time=choice.times[index]) for index in choice.indices]
-    data = assemble(frames, options, folder=folder, split=split, notes=choice.notes)
+    data = assemble(frames, options, folder=folder, split=split, notes=(*notes, *choice.notes))
     data.bounds = _bounds(rows[wanted, 15:])
     points = next((folder / name for name in POINTS if (folder / name).is_file()), None)
     return data if points is None else with_points(data, *read_points(points))
@@ -121,7 +122,7 @@ def _cameras(folder: Path) -> list[Path]:
     """Return the cameras' folders of images, in the order of their names."""
     base = folder / "frames" if (folder / "frames").is_dir() else folder
     cameras = []
-    for camera in sorted((p for p in base.iterdir() if p.is_dir()), key=lambda p: natural(p.name)):
+    for camera in sorted((p for p in base.iterdir() if p.is_dir() and _is_shown(p)), key=lambda p: natural(p.name)):
         inner = camera / "images" if (camera / "images").is_dir() else camera
         if _files(inner):
             cameras.append(inner)
@@ -136,8 +137,26 @@ def _cameras(folder: Path) -> list[Path]:
     raise UserError(f"{base}: no folder of images for any camera; put them into cam00/images, cam01/images, ...")
 
 
+def _of_rig(folder: Path, cameras: list[Path], count: int) -> tuple[list[Path], tuple[str, ...]]:
+    """Return the ``count`` folders whose names differ only in their numbers, if there are more folders, and a note on
+    the others: programs put images for COLMAP, or masks, beside the cameras."""
+    alike: dict[str, list[Path]] = {}
+    for camera in cameras:
+        alike.setdefault(re.sub("[0-9]+", "0", _label(folder, camera)), []).append(camera)
+    fitting = [group for group in alike.values() if len(group) == count]
+    if len(cameras) <= count or len(fitting) != 1:
+        return cameras, ()
+    others = ", ".join(_label(folder, camera) for camera in cameras if camera not in fitting[0])
+    return fitting[0], (f"{folder}: of more folders than {FILE} has rows, these are left out: {others[:80]}",)
+
+
+def _is_shown(path: Path) -> bool:
+    """Return whether a file or folder is none that systems hide, such as ``._0000.png`` of macOS."""
+    return not path.name.startswith(".")
+
+
 def _files(folder: Path) -> list[Path]:
-    files = [p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES]
+    files = [p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES and _is_shown(p)]
     return sorted(files, key=lambda p: natural(p.name))
 
 

@@ -43,7 +43,13 @@ def read_transforms(path: Path) -> dict[str, Any]:
     for index, entry in enumerate(frames):
         if not isinstance(entry, dict):
             raise UserError(f"{path}: frames[{index}] is not an object; give file_path and transform_matrix")
-    return content
+    given = {**content, "frames": [_given(entry) for entry in frames]}
+    return _given(given)
+
+
+def _given(fields: dict[str, Any]) -> dict[str, Any]:
+    """Leave out fields without a value, which exporters write as null."""
+    return {key: value for key, value in fields.items() if value is not None}
 
 
 def read_pose(path: Path, index: int, entry: dict[str, Any]) -> np.ndarray:

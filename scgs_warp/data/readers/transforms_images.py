@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import re
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any, NamedTuple
 
 from ...errors import UserError
-from ...storage.safe_paths import in_any_case, inside
+from ...storage.safe_paths import first_there, inside
 from ..moved_images import Move, find_move, parts_of
 from .colmap_images import reduced_folders
 from .transforms import SUFFIXES
@@ -39,7 +39,8 @@ def find_images(path: Path, folder: Path, entries: list[dict[str, Any]]) -> Fram
         moved = _moved(path, folder, entries)
         if moved is not None:
             return moved
-    return FrameFiles([_find_image(path, folder, index, name) for index, name in enumerate(names)], entries, ())
+    files = [_find_image(path, folder, index, name) for index, name in enumerate(names)]
+    return FrameFiles(files, entries, _other_suffixes(path, names, files))
 
 
 def _moved(path: Path, folder: Path, entries: list[dict[str, Any]]) -> FrameFiles | None:
@@ -82,11 +83,22 @@ def _existing(folder: Path, name: str) -> Path | None:
 
 
 def _completed(base: Path) -> Path:
-    if base.is_file():
-        return base
-    names = [base.name] if base.suffix.lower() in SUFFIXES else [base.name + suffix for suffix in SUFFIXES]
-    candidates = [base.with_name(name) for name in names]
-    return next((found for found in map(in_any_case, candidates) if found is not None), candidates[0])
+    if base.suffix.lower() in SUFFIXES:
+        candidates = [base, *(base.with_suffix(suffix) for suffix in SUFFIXES)]
+    else:
+        candidates = [base.with_name(base.name + suffix) for suffix in SUFFIXES]
+    return base if base.is_file() else first_there(candidates) or candidates[0]
+
+
+def _other_suffixes(path: Path, names: list[str], files: list[Path]) -> tuple[str, ...]:
+    """Return a note if images have other suffixes than their names, as after a conversion."""
+    pairs = [(PurePosixPath(name.replace("\\", "/")), file) for name, file in zip(names, files)]
+    other = [
+        f"{file.name} for {name.name}"
+        for name, file in pairs
+        if name.suffix.lower() in SUFFIXES and name.suffix.lower() != file.suffix.lower()
+    ]
+    return (f"{path}: images of other names than listed are used, such as {other[0]}",) if other else ()
 
 
 def is_foreign(name: str) -> bool:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 
+import cv2
 import numpy as np
 import pytest
 import torch
@@ -64,6 +65,25 @@ def test_nerfies_without_what_may_be_missing(tmp_path):
     assert train.points is None and [frame.name for frame in test] == ["000005"]
     assert not {frame.name for frame in train} & {frame.name for frame in test} and len(train) == 11
     assert float(test.times[0]) == pytest.approx(4 / 11)
+
+
+@pytest.mark.parametrize("suffix", [".PNG", ".webp", ".JPG"])
+def test_images_of_other_kinds(tmp_path, suffix):
+    write_nerfies(tmp_path)
+    for file in list((tmp_path / "rgb/1x").iterdir()):
+        image = cv2.imread(str(file))
+        file.unlink()
+        encoded = cv2.imencode(suffix, image, [cv2.IMWRITE_JPEG_QUALITY, 100, cv2.IMWRITE_WEBP_QUALITY, 101])[1]
+        file.with_suffix(suffix).write_bytes(encoded.tobytes())
+    assert share_found(load(tmp_path), 0.06) > FOUND
+
+
+def test_cameras_without_a_size_have_that_of_the_images(tmp_path):
+    write_nerfies(tmp_path)
+    for file in (tmp_path / "camera").iterdir():
+        change(file, lambda content: content.pop("image_size"))
+    np.testing.assert_allclose(load(tmp_path)[0].camera.K, K, atol=1e-5)
+    np.testing.assert_allclose(load(tmp_path, downscale=2)[0].camera.K[:2], K[:2] / 2, atol=1e-5)
 
 
 def test_nerfies_times_of_newer_data(tmp_path):

@@ -203,6 +203,26 @@ def test_fields_that_programs_leave_empty(tmp_path):
     assert "frames[0].time is missing" in message(tmp_path)
 
 
+def test_fields_of_the_whole_file_that_programs_leave_empty(tmp_path):
+    empty = ("k1", "p1", "camera_model", "distortion_params", "applied_transform", "cy", "is_fisheye")
+    write(tmp_path, **dict.fromkeys(empty), ply_file_path="")
+    data = load(tmp_path)
+    assert data.points is None and float(data[0].camera.K[1, 2]) == HEIGHT / 2
+
+
+def test_images_that_were_converted(tmp_path):
+    """The names keep their suffix; a note says so."""
+    write(tmp_path)
+    for file in list(tmp_path.glob("*.png")):
+        cv2.imwrite(str(file.with_suffix(".webp")), cv2.imread(str(file)), [cv2.IMWRITE_WEBP_QUALITY, 101])
+        file.unlink()
+    data = load(tmp_path)
+    assert len(data) == 18
+    assert any("images of other names than listed are used, such as f_0.webp for f_0.png" in n for n in data.notes)
+    write(tmp_path, frames=[{**f, "file_path": f["file_path"][:-4]} for f in write(tmp_path)["frames"]])
+    assert not load(tmp_path).notes, "names without a suffix are of any"
+
+
 def test_times_in_seconds(tmp_path):
     content = write(tmp_path)
     expected = load(tmp_path).times
@@ -282,7 +302,7 @@ def test_masks_of_frames(tmp_path):
 
 FAULTS = {
     "distortion": (lambda content: content.__setitem__("k1", "much"), "k1 is 'much', not a number"),
-    "a frame's distortion": (lambda content: content["frames"][3].__setitem__("p2", None), "p2 is 'None'"),
+    "a frame's distortion": (lambda content: content["frames"][3].__setitem__("p2", "no"), "p2 is 'no'"),
     "k5": (lambda content: content.__setitem__("k5", 0.1), "k5 is 0.1, a lens distortion that camera_model None does"),
     "tangential fisheye": (
         lambda content: content.update({"camera_model": "OPENCV_FISHEYE", "p1": 0.1}),

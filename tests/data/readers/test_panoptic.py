@@ -28,6 +28,13 @@ def test_panoptic(tmp_path):
     assert len({frame.name for frame in train}) == 15
 
 
+def test_names_in_other_case(tmp_path):
+    write_panoptic(tmp_path)
+    for file in list((tmp_path / "ims").rglob("*.jpg")):
+        file.rename(file.with_suffix(".JPG"))
+    assert len(load(tmp_path)) == 15
+
+
 def test_panoptic_trains_with_shared_time(tmp_path):
     from helpers.tiny import tiny_config
     from scgs_warp.training.frames import Frames

@@ -101,6 +101,27 @@ def test_images_that_are_missing(tmp_path):
     )
 
 
+def test_what_systems_hide_is_no_image(tmp_path):
+    """macOS puts such files beside others on disks of other systems."""
+    write_poses_bounds(tmp_path)
+    for file in list(tmp_path.rglob("*.png")):
+        file.with_name(f"._{file.name}").write_bytes(b"\0\5\x16\7")
+    (tmp_path / ".hidden").mkdir()
+    cv2.imwrite(str(tmp_path / ".hidden/a.png"), np.zeros((9, 9), np.uint8))
+    assert len(load(tmp_path)) == 9 and not load(tmp_path).notes
+
+
+def test_folders_of_other_images_beside_the_cameras(tmp_path):
+    """Scripts put images for COLMAP there."""
+    write_poses_bounds(tmp_path)
+    for name in ("image_colmap", "cam_mask"):
+        (tmp_path / name).mkdir()
+        cv2.imwrite(str(tmp_path / name / "r_000.png"), np.zeros((HEIGHT, WIDTH), np.uint8))
+    train = load(tmp_path)
+    assert len(train) == 9 and share_found(train) > FOUND
+    assert len(train.notes) == 1 and train.notes[0].endswith("these are left out: cam_mask, image_colmap")
+
+
 FAULTS = {
     "damaged": (noise("poses_bounds.npy"), "poses_bounds.npy: no sound"),
     "shape": (bounds(lambda rows: rows[:, :15]), "has shape [4, 15]"),
