@@ -67,8 +67,8 @@ def read_splits(folder: Path) -> Splits | None:
             continue
         content = read_json(path)
         listed = content.get("frame_names")
-        if not isinstance(listed, list):
-            raise UserError(f"{path}: frame_names is missing or not a list; name the frames there")
+        if not isinstance(listed, list) or (name == TRAIN and not listed):
+            raise UserError(f"{path}: frame_names is missing, empty or not a list; name the frames there")
         names.extend(str(item) for item in listed)
         if content.get("time_ids") is not None:
             splits.times.update(zip(names, _ids(path, "time_ids", content["time_ids"], len(names))))

@@ -121,8 +121,6 @@ def _listing(folder: Path) -> Listing:
         lists = {"ids": [], "train_ids": splits.train, "val_ids": splits.val}
         _check_names(path, "frame_names", [*splits.train, *splits.val])
     names = list(dict.fromkeys(name for each in lists.values() for name in each))
-    if not names:
-        raise UserError(f"{path}: lists no frame; name the frames there")
     if times and cameras:
         return Listing(
             path,
