@@ -6,7 +6,7 @@ import contextlib
 import functools
 import sys
 from collections.abc import Callable, Iterator
-from typing import ParamSpec, TypeVar, cast
+from typing import Any, ParamSpec, TypeVar
 
 import torch
 
@@ -28,7 +28,8 @@ def unaffected(function: Callable[Parameters, Result]) -> Callable[Parameters, R
         run = function
         if "torch._dynamo" in sys.modules:  # importing the compiler takes a second
             if not eager:
-                eager.append(cast("Callable[Parameters, Result]", torch.compiler.disable(function)))
+                untraced: Any = torch.compiler.disable(function)
+                eager.append(untraced)
             run = eager[0]
         if _as_usual():
             return run(*args, **kwargs)
