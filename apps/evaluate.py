@@ -39,7 +39,8 @@ class Options:
     """Also score each image with the affine colour (exposure, white balance) that fits it best. A run with
     optim.frame_colors is always scored so, and with the colours of the training frames before and after."""
     json: Path | None = None
-    """File for the metrics; by default metrics.json in RUN/evaluation/SPLIT, with --also in SPLIT-mean."""
+    """File for the metrics; by default metrics.json in RUN/evaluation/SPLIT, with --also in SPLIT-mean. With it, a run
+    that cannot be written is scored without renders."""
     device: Device = "auto"
     """Where to render; auto takes a GPU if there is one."""
     threads: int | None = None
@@ -87,6 +88,25 @@ def other_images(run: Path, dataset: Dataset) -> str | None:
     return (
         f"{dataset.folder}: its {dataset.split} images are not those with which {run} was trained; scoring them anyway"
     )
+
+
+def pictures_folder(folder: Path, metrics: Path | None) -> Path | None:
+    """Return the folder for renders; if it cannot be written and the metrics go elsewhere, say so and return None.
+
+    Raises:
+        UserError: neither renders nor metrics could be written.
+    """
+    from scgs_warp.errors import UserError
+    from scgs_warp.storage.output_folders import make_parent
+
+    try:
+        make_parent(folder / "metrics.json")
+    except UserError:
+        if metrics is None:
+            raise UserError(f"{folder}: cannot be written; give --json FILE for the scores alone") from None
+        print(f"note: {folder}: cannot be written, so that no renders are kept")
+        return None
+    return folder
 
 
 def show(metrics: dict[str, Any], unfinished: str | None) -> None:
@@ -162,6 +182,7 @@ def main(args: list[str] | None) -> None:
         dataset, poses = (dataset, poses) if corrected is None else (corrected, "refined")
     kinds = [options.split, *(["mean"] if options.also else []), *([dataset.background] if recolored else [])]
     folder = options.run / "evaluation" / "-".join(kinds)
+    pictures = pictures_folder(folder, options.json)
     known = [seconds for run in runs if (seconds := training_seconds(run)) is not None]
     with progress(len(dataset), "evaluate") as shown:
         metrics = metrics_of(
@@ -169,7 +190,7 @@ def main(args: list[str] | None) -> None:
             dataset,
             seconds=sum(known) if len(known) == len(runs) else None,
             lpips=lpips,
-            render_dir=folder,
+            render_dir=pictures,
             progress=lambda done, total: shown.advance(),
             colors=None if options.also else FrameColors.read(options.run),
             fit_color=options.fit_color,
@@ -184,7 +205,7 @@ def main(args: list[str] | None) -> None:
     if uncovered is not None:
         print(uncovered)
     print("poses: as training refined them" if poses == "refined" else "poses: as the data give them")
-    print(f"renders and ground truth: {folder}; metrics: {target}")
+    print(f"{'' if pictures is None else f'renders and ground truth: {folder}; '}metrics: {target}")
 
 
 def cli(args: list[str] | None = None) -> int:

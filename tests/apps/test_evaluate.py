@@ -69,3 +69,16 @@ def test_a_background_of_filled_images_is_refused(dnerf, trained, tmp_path):
     done = run_app("evaluate", *where)
     line = f"error: --background white: the images of {filled} have no alpha; leave it out"
     assert done.returncode == 2 and line in done.stderr, done.stderr
+
+
+def test_a_run_that_cannot_be_written_is_scored_alone(trained, tmp_path):
+    run = tmp_path / "run"
+    shutil.copytree(trained, run, ignore=shutil.ignore_patterns("evaluation"))
+    (run / "evaluation").write_text("a file, in which nobody can make a folder")
+    done = run_app("evaluate", "--run", str(run), "--device", "cpu")
+    assert done.returncode == 2, done.stdout
+    assert f"{run / 'evaluation/test'}: cannot be written; give --json FILE for the scores alone" in done.stderr
+    path = tmp_path / "metrics.json"
+    done = run_app("evaluate", "--run", str(run), "--json", str(path), "--device", "cpu")
+    assert done.returncode == 0 and "so that no renders are kept" in done.stdout, done.stderr
+    assert json.loads(path.read_text())["psnr"] == json.loads((trained / "metrics.json").read_text())["psnr"]
