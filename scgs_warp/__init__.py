@@ -6,9 +6,11 @@ Importing the package is cheap: torch and Warp are loaded when one of its names 
 from __future__ import annotations
 
 import importlib
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from .runtime.environment import prepare_environment as _prepare_environment
+from .scene import film_maker as _film_maker
 from .scene import page_maker as _page_maker
 
 __version__ = "0.1.0"
@@ -17,6 +19,7 @@ _prepare_environment()
 
 if TYPE_CHECKING:
     from .rendering.rasterize import rasterization as rasterization
+    from .scene.scene import Scene as Scene
     from .training.loop import fit as fit
     from .training.one_call import train as train
     from .types import Camera as Camera
@@ -24,7 +27,6 @@ if TYPE_CHECKING:
     from .types import Gaussians as Gaussians
     from .types import Image as Image
     from .types import Pose as Pose
-    from .visualization.films import Scene as Scene
 
 _EXPORTS = {
     "Camera": "types",
@@ -32,7 +34,7 @@ _EXPORTS = {
     "Gaussians": "types",
     "Image": "types",
     "Pose": "types",
-    "Scene": "visualization.films",
+    "Scene": "scene.scene",
     "fit": "training.loop",
     "rasterization": "rendering.rasterize",
     "train": "training.one_call",
@@ -45,7 +47,13 @@ def _framed_page(scene: Any) -> str | None:
     return importlib.import_module(".export.notebook", __name__).framed_page(scene)
 
 
+def _film(scene: Any, path: str | Path, **options: Any) -> Path:
+    """Write what ``Scene.turntable`` films."""
+    return importlib.import_module(".visualization.films", __name__).turntable(scene, path, **options)
+
+
 _page_maker.register(_framed_page)
+_film_maker.register(_film)
 
 
 def __getattr__(name: str):

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from ..geometry import cameras
+from ..runtime.caller_settings import unaffected
 from ..types import Camera
 from ..visualization.figures import to_bytes
 from ..visualization.video import film, require_memory
@@ -96,6 +97,7 @@ def _at_once(draw: Callable[[], np.ndarray]) -> np.ndarray:
     return draw()
 
 
+@unaffected
 def render_film(
     session: EditSession,
     output: str | Path,

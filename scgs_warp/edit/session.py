@@ -17,6 +17,7 @@ from torch import Tensor
 from ..errors import UserError
 from ..formats.gaussian_ply import write_gaussian_ply
 from ..rendering.render import render
+from ..runtime.caller_settings import unaffected_methods
 from ..scene.arguments import given_camera, given_color
 from ..scene.scene import Scene
 from ..storage.files import write_atomically
@@ -38,6 +39,7 @@ HISTORY = 1000
 """Number of steps that can be undone, so that a session which is open for days does not grow without limit."""
 
 
+@unaffected_methods
 class EditSession(Posing):
     """A scene, its graph of control points, an :class:`Edit`, and the last thousand edits for undo.
 

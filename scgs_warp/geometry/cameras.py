@@ -268,7 +268,8 @@ def orbit_camera(overview: Overview, azimuth: float, size: int, elevation: float
     aside = math.cos(turn) * zero + math.sin(turn) * ninety
     eye = centre + overview.radius * (math.cos(tilt) * aside + math.sin(tilt) * up)
     focal = width / (2 * math.tan(math.radians(overview.fov_x) / 2))
-    K = torch.tensor([[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]])
+    rows = [[focal, 0.0, width / 2], [0.0, focal, height / 2], [0.0, 0.0, 1.0]]
+    K = torch.tensor(rows, dtype=torch.float32, device="cpu")
     return Camera(look_at(eye, centre, up), K, width, height)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import inspect
 import sys
 from collections.abc import Callable, Iterator
 from typing import Any, ParamSpec, TypeVar
@@ -12,6 +13,7 @@ import torch
 
 Parameters = ParamSpec("Parameters")
 Result = TypeVar("Result")
+Kind = TypeVar("Kind")
 
 KINDS = ("cpu", "cuda")
 """Kinds of devices that may have autocast."""
@@ -37,6 +39,15 @@ def unaffected(function: Callable[Parameters, Result]) -> Callable[Parameters, R
             return run(*args, **kwargs)
 
     return call
+
+
+def unaffected_methods(kind: type[Kind]) -> type[Kind]:
+    """Make all methods of a class, also those that it inherits, :func:`unaffected`."""
+    for name in dir(kind):
+        method = inspect.getattr_static(kind, name)
+        if inspect.isfunction(method) and (name == "__init__" or not name.startswith("__")):
+            setattr(kind, name, unaffected(method))
+    return kind
 
 
 def _as_usual() -> bool:

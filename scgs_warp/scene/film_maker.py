@@ -15,11 +15,5 @@ def register(maker: Callable[..., Path]) -> None:
 
 
 def film(scene: Any, path: str | Path, **options: Any) -> Path:
-    """Write a film of a scene.
-
-    Raises:
-        RuntimeError: ``scgs_warp.visualization.films`` has not been imported.
-    """
-    if not _makers:
-        raise RuntimeError("import scgs_warp.visualization.films first, or take Scene from scgs_warp")
+    """Write a film of a scene."""
     return _makers[0](scene, path, **options)

@@ -15,7 +15,7 @@ from ..errors import UserError
 from ..runtime import environment
 from ..runtime.caller_settings import unaffected
 from ..runtime.progress import Report, quiet, reported, say
-from ..visualization.films import Scene
+from ..scene.scene import Scene
 from .dataset_advice import advise, survey
 from .loop import fit
 from .preflight import refuse_early

@@ -1,4 +1,4 @@
-"""Films of a scene in one call; importing this module gives scenes their method ``turntable``."""
+"""Films of a scene in one call."""
 
 from __future__ import annotations
 
@@ -8,16 +8,15 @@ from typing import Literal
 
 from ..errors import UserError
 from ..geometry import cameras
+from ..runtime.caller_settings import unaffected
 from ..runtime.progress import progress
-from ..scene import film_maker
 from ..scene.scene import Scene
 from . import video
 from .framing import framed
 from .overlay import Painter
 
-__all__ = ["Scene", "turntable"]
 
-
+@unaffected
 def turntable(
     scene: Scene,
     path: str | Path,
@@ -55,6 +54,3 @@ def turntable(
             writer.write(painter.paint(camera, moment))
             bar.advance()
     return target
-
-
-film_maker.register(turntable)

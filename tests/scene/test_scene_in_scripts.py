@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import copy
+import dataclasses
 import pickle
+import subprocess
+import sys
 
 import pytest
 import torch
 
-from helpers.edit_scenes import bar_scene
 from helpers.export_runs import moving_run
 from helpers.tiny import tiny_camera
 from helpers.torch_settings import SETTINGS
-from scgs_warp.edit import EditSession
+from scgs_warp.edit import EditSession, render_film
+from scgs_warp.edit.document import Film
 from scgs_warp.scene.scene import Scene
 
 
@@ -56,10 +59,33 @@ def test_what_a_script_has_set_for_torch_changes_nothing(run, setting):
     assert torch.equal(points, truth.control_points_at(0.3))
 
 
-def test_an_edited_scene_is_drawn_under_autocast():
-    session = EditSession(bar_scene(nodes=12, gaussians=60))
-    session.add_handle([0, 1], time=0.0, name="end")
-    session.move("end", translation=(0.0, 0.1, 0.0))
-    truth = session.render(tiny_camera(0, 4, 24), 0.3)
-    with SETTINGS["autocast"]():
-        assert torch.equal(session.render(tiny_camera(0, 4, 24), 0.3).rgb, truth.rgb)
+@pytest.mark.parametrize("setting", SETTINGS)
+def test_an_edited_scene_is_the_same(setting, tmp_path):
+    def edited(folder) -> list:
+        session = EditSession(Scene.load(whole))
+        part = next(part.name for part in session.parts() if part.parent)
+        session.pull(part, session.joint_of(part, 0.0) + 0.1)
+        session.add_handle([0, 1], time=0.0, name="end")
+        session.move("end", translation=(0.0, 0.1, 0.0))
+        session.apply(dataclasses.replace(session.edit, film=Film(seconds=0.1, fps=20.0, size=32)))
+        render_film(session, folder / "film")
+        session.scene.turntable(folder / "turntable", frames=2, size=32)
+        session.save(folder / "edit.json")
+        image = session.render(camera, 0.3)
+        frames = [path.read_bytes() for path in sorted(folder.glob("*/*.png"))]
+        return [image.rgb.tolist(), session.node_positions(0.3).tolist(), session.edit, frames]
+
+    camera, whole = tiny_camera(0, 4, 24), moving_run(tmp_path / "run", swing=0.02)
+    truth = edited(tmp_path / "plain")
+    with SETTINGS[setting]():
+        assert edited(tmp_path / "changed") == truth
+    assert len(truth[-1]) == 4
+
+
+def test_scenes_of_fit_can_film_themselves():
+    """Also where nothing has asked for the code that films; importing the package stays cheap."""
+    program = (
+        "import sys, scgs_warp; from scgs_warp.scene import film_maker\n"
+        "assert film_maker._makers and 'torch' not in sys.modules"
+    )
+    subprocess.run([sys.executable, "-c", program], check=True, timeout=100)
