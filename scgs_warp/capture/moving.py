@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator
 import cv2
 import numpy as np
 
+from ..geometry.epipolar import fundamental_matrix
 from ..geometry.optical_flow import at_targets, targets_of, textured
 from .source_frame import shrunk
 
@@ -105,8 +106,8 @@ def leaves_epipolar_line(one: np.ndarray, forth: np.ndarray, back: np.ndarray) -
     if chosen.sum() < MIN_VECTORS:
         return None
     starts = np.stack([x, y], 2)
-    matrix, _ = cv2.findFundamentalMat(starts[chosen], targets[chosen], cv2.USAC_MAGSAC, 0.5, 0.999, 2000)
-    if matrix is None or matrix.shape != (3, 3):
+    matrix, _ = fundamental_matrix(starts[chosen], targets[chosen], 0.5)
+    if matrix is None:
         return None
     distance = sampson(matrix, starts, targets)
     limit = max(MIN_LINE_DISTANCE, TYPICAL_FACTOR * float(np.median(distance[sure])))

@@ -13,6 +13,7 @@ import cv2
 import numpy as np
 
 from ...data.dataset import spread
+from ...geometry.epipolar import fundamental_matrix
 from ..moving import sampson
 from ..source_frame import shrunk
 
@@ -82,17 +83,16 @@ def _pair_error(
         return None
     first, second = (np.array(column) for column in zip(*chosen))
     starts, targets = starts[first], targets[second]
-    _, inside = cv2.findFundamentalMat(starts, targets, cv2.USAC_MAGSAC, 1.0, 0.999, 2000)
+    _, inside = fundamental_matrix(starts, targets, 1.0)
     if inside is None or inside.sum() < ENOUGH:
         return None
-    static = inside[:, 0].astype(bool)
     distance = float(np.linalg.norm(relative[:3, 3]))
     if not distance > 0:  # Cameras at one place have no epipolar lines.
         return None
     x, y, z = relative[:3, 3] / distance
     cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
     matrix = np.linalg.inv(K_two).T @ cross @ relative[:3, :3] @ np.linalg.inv(K_one)
-    return float(np.median(sampson(matrix / np.linalg.norm(matrix), starts[static], targets[static])))
+    return float(np.median(sampson(matrix / np.linalg.norm(matrix), starts[inside], targets[inside])))
 
 
 def _features(image: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
