@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 from .features import Links
@@ -22,6 +24,8 @@ MAX_MASKED = 0.5
 """Share of masked pixels above which masks, and not a lack of texture, leave few features; masks that are found cover
 less."""
 STANDS_STILL = "the camera stands still, so that nothing tells depth"
+LONG = 0.05
+"""Share of a film's time, at one end, in which no frame has a camera, above which the user gets a note."""
 GOOD_SHARE = 0.9
 """Share of registered frames above which the user gets no note."""
 
@@ -90,3 +94,25 @@ def notes(outcome: Outcome) -> list[str]:
     elif outcome.arc < MIN_ARC:
         lines.append(f"note: rays to a point differ by {outcome.arc:.1f} degrees only; depth will be uncertain")
     return lines
+
+
+def unseen_ends(seconds: Sequence[float], span: tuple[float, float]) -> list[str]:
+    """Return a note if no frame near the beginning or the end of a film has a camera.
+
+    Args:
+        seconds: times of the frames with a camera.
+        span: times of the film's ends.
+    """
+    least, parts, options = LONG * (span[1] - span[0]), [], []
+    if min(seconds) - span[0] > least:
+        start = math.floor(100 * min(seconds)) / 100
+        parts, options = [f"before second {start:g}"], [f"--start {start:g}"]
+    if span[1] - max(seconds) > least:
+        end = math.ceil(100 * max(seconds)) / 100
+        parts, options = [*parts, f"after second {end:g}"], [*options, f"--end {end:g}"]
+    if not options:
+        return []
+    return [
+        f"note: no frame {' and '.join(parts)} has a camera, and training guesses the motion there; "
+        f"{' '.join(options)} and another --output leave that out"
+    ]

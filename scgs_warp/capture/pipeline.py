@@ -15,7 +15,7 @@ from ..storage.json_files import as_number
 from ..visualization.video import write_png
 from . import bundle_adjustment, features, mapping, moving, pictures, writing
 from .colmap import remove_database
-from .diagnosis import Outcome, notes, too_few
+from .diagnosis import Outcome, notes, too_few, unseen_ends
 from .features import FrameFiles
 from .folder_content import photographs_left_out
 from .given_masks import read_masks
@@ -79,6 +79,8 @@ def _capture(
         raise UserError(too_few(str(folder), outcome))
     if not before:
         _write(folder, frames, frame_files, solved, request.keep, show)
+    if source.video:
+        lines += unseen_ends([frames.seconds[place] for place in solved.places], frames.span)
     return CaptureResult(outcome, [*lines, *notes(outcome)], before)
 
 

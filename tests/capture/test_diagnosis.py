@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from scgs_warp.capture.diagnosis import Outcome, likely_reason, notes, too_few
+from scgs_warp.capture.diagnosis import Outcome, likely_reason, notes, too_few, unseen_ends
 from scgs_warp.capture.features import Links
 
 LINKS = Links(2000, 300, 1.0, 0.3)
@@ -27,3 +27,11 @@ def test_the_likeliest_reason_is_given():
     assert "--least" not in too_few("out", Outcome(50, 0, 0, LINKS, 0.1))
     assert not notes(Outcome(50, 50, 9, LINKS, 0.1)) and len(notes(Outcome(50, 40, 9, LINKS, 0.1))) == 1
     assert "uncertain" in notes(Outcome(50, 50, 1.0, LINKS, 0.1))[0]
+
+
+def test_ends_of_the_film_without_cameras_are_named():
+    """Times go from 0 to 1 over the whole film, and motion there is made up."""
+    assert unseen_ends([0.2, 5.0, 9.7], (0.0, 10.0)) == []
+    assert "--start 6 and another" in unseen_ends([6.004, 14.6], (0.0, 14.7))[0]
+    assert "--end 4.27 and another" in unseen_ends([2.0, 4.262], (2.0, 9.0))[0]
+    assert "--start 3 --end 5 and another" in unseen_ends([3.0, 5.0], (0.0, 9.0))[0]

@@ -8,6 +8,9 @@ from typing import Any, NamedTuple
 from ...storage.json_files import as_number
 from ..source import Video
 
+LEAST_SIDE = 480
+"""Longer side to which pictures are reduced at most, for that of a smaller one: cameras are found with them. Beyond it,
+they are cut."""
 FAR_LARGER = 1.4
 """Ratio of the longer sides of two cameras' pictures above which the smaller one is worth a note."""
 
@@ -16,7 +19,7 @@ class CommonSize(NamedTuple):
     """How the pictures of C cameras come to have about one size."""
 
     longest: int
-    """Longer side, pixels."""
+    """Largest size of the longer side, pixels."""
     turns: list[int]
     """[C] quarter turns, counter-clockwise: phones may be held upright beside others that are not."""
     limited_by: int | None
@@ -31,7 +34,8 @@ class CommonSize(NamedTuple):
             else []
         )
         if self.limited_by is not None:
-            lines.append(f"note: all pictures are as small as those of {names[self.limited_by]}: {self.longest} pixels")
+            small = names[self.limited_by]
+            lines.append(f"note: all pictures become as small as those of {small}; without its video, they are larger")
         return lines
 
 
@@ -45,10 +49,12 @@ def common_size(videos: Sequence[Video], most: int) -> CommonSize:
     longer = [max(shape) for shape in shapes]
     upright = [height > width for height, width in shapes]
     mostly = 2 * sum(upright) + upright[0] > len(upright)
-    # By the turn of phones that are held upright, the lens of one that is turned stays as it is.
+    # A phone that is held upright turns its pictures clockwise; its lens stays as it is if that is undone.
     turns = [0 if each == mostly else 3 if mostly else 1 for each in upright]
     limits = max(longer) > FAR_LARGER * min(longer)
-    return CommonSize(min(longer), turns, longer.index(min(longer)) if limits else None)
+    return CommonSize(
+        max(min(longer), min(LEAST_SIDE, max(longer))), turns, longer.index(min(longer)) if limits else None
+    )
 
 
 def common_size_of(stored: Any, count: int) -> CommonSize | None:

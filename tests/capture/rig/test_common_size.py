@@ -29,8 +29,11 @@ def videos(folder, *sizes: tuple[int, int]) -> list[Video]:
         ([(160, 90), (90, 160), (160, 90)], CommonSize(160, [0, 1, 0], None)),
         ([(90, 160), (160, 90), (90, 160)], CommonSize(160, [0, 3, 0], None)),
         ([(90, 160), (160, 90)], CommonSize(160, [0, 3], None)),
-        ([(160, 90), (120, 90), (160, 90)], CommonSize(120, [0, 0, 0], None)),
-        ([(160, 90), (160, 90), (64, 48)], CommonSize(64, [0, 0, 0], 2)),
+        ([(640, 90), (600, 90), (640, 90)], CommonSize(600, [0, 0, 0], None)),
+        ([(640, 90), (640, 90), (560, 48)], CommonSize(560, [0, 0, 0], None)),
+        ([(690, 90), (690, 90), (490, 48)], CommonSize(490, [0, 0, 0], 2)),
+        ([(690, 90), (690, 90), (64, 48)], CommonSize(480, [0, 0, 0], 2)),
+        ([(160, 90), (160, 90), (64, 48)], CommonSize(160, [0, 0, 0], 2)),
     ],
 )
 def test_the_smallest_and_the_most_decide(tmp_path, sizes, expected):
@@ -42,7 +45,7 @@ def test_what_was_changed_is_said():
     names = ["a", "b", "c"]
     assert CommonSize(160, [0, 0, 0], None).describe(names) == []
     turned, small = CommonSize(64, [0, 1, 1], 2).describe(names)
-    assert "b, c are turned by a quarter" in turned and "as small as those of c: 64 pixels" in small
+    assert "b, c are turned by a quarter" in turned and "as small as those of c; without its video" in small
 
 
 def test_the_journal_keeps_it():

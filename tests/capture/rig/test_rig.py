@@ -18,7 +18,7 @@ from helpers.full_disk import FakeDisk
 from helpers.rigs import FPS, RigFilms, film_rig, write_poses_bounds
 from scgs_warp.apps import capture as app
 from scgs_warp.capture import RigRequest, capture_rig, pictures
-from scgs_warp.capture.rig import pipeline
+from scgs_warp.capture.rig import common_size, pipeline
 from scgs_warp.capture.rig.neural_video import write_neural_video
 from scgs_warp.capture.rig.points import points_at
 from scgs_warp.capture.similarity import align, centres
@@ -162,8 +162,9 @@ def test_a_folder_is_complete_once_all_is_written(films, captured, tmp_path, mon
     assert not (tmp_path / "out/poses_bounds.npy").exists()
 
 
-def test_cameras_that_are_held_otherwise_or_have_more_pixels_are_used_whole(films, tmp_path):
+def test_cameras_that_are_held_otherwise_or_have_more_pixels_are_used_whole(films, tmp_path, monkeypatch):
     """Pictures of the one are turned, those of the other reduced, instead of cut."""
+    monkeypatch.setattr(common_size, "LEAST_SIDE", 100)
     folder = tmp_path / "rig"
     shutil.copytree(films.folder, folder)
     for name, change in (("cam2", lambda image: np.rot90(image, 3)), ("cam4", lambda image: np.kron(image, DOUBLE))):
@@ -174,6 +175,8 @@ def test_cameras_that_are_held_otherwise_or_have_more_pixels_are_used_whole(film
     data = load(tmp_path / "out")
     assert min(data[0].image.shape[:2]) > 0.9 * 180 and max(data[0].image.shape[:2]) > 0.9 * 320
     content = json.loads((tmp_path / "out/transforms.json").read_text())
+    focals = [frame["fl_x"] for frame in content["frames"]]
+    assert max(focals) < 1.1 * min(focals), "none sees less than the others"
     ups = {f["camera"]: np.array(f["transform_matrix"])[:3, 1] for f in content["frames"]}
     assert all(up[2] > 0.8 for name, up in ups.items() if name != "cam2"), "the world is upright"
 
