@@ -29,7 +29,7 @@ from .neural_video import POSES, KnownCameras, known_cameras, write_neural_video
 from .points import points_at
 from .request import FEWEST_CAMERAS, RigRequest, check, videos_of
 from .sound import read_sound
-from .writing import write_rig
+from .writing import FEW_CAMERAS, write_rig
 
 SHEET = "contact_sheet.png"
 
@@ -45,6 +45,7 @@ class RigResult(NamedTuple):
     registered: list[str]
     """Names of the cameras that were found."""
     held_out: str
+    """Name of the camera that is held out, or what is held out of fewer than ``FEW_CAMERAS``."""
     lines: list[str]
     """Description of the result, for the user."""
     made_before: bool
@@ -96,13 +97,14 @@ def _capture(rig: _Rig, known: KnownCameras | None) -> RigResult:
     if held_out in missing:
         raise UserError(f"--held-out {held_out}: its pose was not found; hold out another camera")
     lines = [rig.describe(line), rig.describe_clock(starts)]
-    lines += [f"note: {', '.join(missing)} shares too little with the others and is left out"] if missing else []
+    lines += [f"note: {', '.join(missing)}: too little in common with the others; left out"] if missing else []
     lines += own_lenses.describe_lenses(solved) if request.lens == "auto" else []
     lines += [*rig.size.describe(names), *rig.cut_off(), *rig.unadjusted(), *rig.unsteady()]
     if not before:
         extra = rig.points(solved.cameras)
         write_rig(folder, solved, extra, names, line, held_out, rig.picture, show, rig.size.turns)
-    return RigResult(names, starts, [n for n in names if n not in missing], held_out, lines, before)
+    held = held_out if len(solved.cameras) >= FEW_CAMERAS else "every eighth instant"
+    return RigResult(names, starts, [n for n in names if n not in missing], held, lines, before)
 
 
 class _Rig:
@@ -326,7 +328,7 @@ class _Rig:
         found = len(solved.cameras)
         if found < max(self.request.least * len(self.names), FEWEST_CAMERAS):
             raise UserError(
-                f"{self.folder}: {found} of {len(self.names)} cameras found; {', '.join(missing)} shares too little "
+                f"{self.folder}: {found} of {len(self.names)} cameras found; {', '.join(missing)} share too little "
                 "with the others: put cameras closer together, or show them more texture; --least "
                 f"{math.floor(100 * found / len(self.names)) / 100:g} takes it as it is (finished work is kept; the "
                 "same command continues from it)"

@@ -139,6 +139,11 @@ def test_cameras_that_are_not_adjusted_are_named(films, captured, tmp_path):
     assert any(line.startswith("note: ") and "adjust" in line for line in run(films.folder, other).lines)
 
 
+def test_what_is_held_out_of_few_cameras_is_said(films, captured, monkeypatch):
+    monkeypatch.setattr(pipeline, "FEW_CAMERAS", 7)
+    assert run(films.folder, captured).held_out == "every eighth instant"
+
+
 def test_a_folder_is_complete_once_all_is_written(films, captured, tmp_path, monkeypatch):
     """A full disk or Ctrl-C at the last file leaves no folder that passes for a finished one."""
     folder = tmp_path / "rig"
