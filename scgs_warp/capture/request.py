@@ -57,6 +57,8 @@ def check(request: CaptureRequest) -> None:
         raise UserError(f"--start {start:g} --end {end:g}: give two seconds of the video, the earlier one as --start")
     if not request.masks.strip():
         raise UserError("--masks: is followed by an empty name; give auto, none, a folder or a video")
+    if request.masks not in ("auto", "none") and not Path(request.masks).exists():
+        raise UserError(f"--masks {request.masks}: no such file or folder; give auto, none, or masks")
     if request.keep == "moving" and request.masks in ("auto", "none"):
         raise UserError(
             "--keep-static off: needs masks of the whole mover, black where it is; give --masks DIR or --masks "

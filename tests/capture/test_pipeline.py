@@ -329,6 +329,7 @@ def test_a_film_that_is_too_short_or_rests(tmp_path, filmed):
     [({"frames": 2}, "--frames 2"), ({"size": 4}, "--size 4"), ({"fov": 500.0}, "--fov 500"),
      ({"least": 2.0}, "--least"), ({"features": 1}, "--features"), ({"seed": -1}, "--seed"),
      ({"start": 3.0, "end": 2.0}, "--start 3 --end 2"), ({"keep": "moving"}, "--keep-static off: needs masks"),
+     ({"masks": "nowhere"}, "--masks nowhere: no such file or folder; give auto, none, or masks"),
      ({"keep": "static", "masks": "none"}, "--keep-moving off: needs masks")],
 )  # fmt: skip
 def test_options_that_cannot_work(tmp_path, options, named):
