@@ -2,8 +2,9 @@
 
 ``poses_bounds.npy [C, 17]``: rows of 3 x 5, the camera-to-world rotation in columns (down, right, backwards),
 position, and (height, width, focal length) in pixels; nearest and farthest depth. Row c belongs to the c-th camera in
-the order of names: ``cam00/images/0000.png``, ``cam00/0000.png`` or ``frames/cam00/0000.png``. Layout: Mildenhall
-et al., LLFF, 2019; Li et al., Neural 3D Video Synthesis, CVPR 2022.
+the order of names: ``cam00/images/0000.png``, ``cam00/0000.png`` or ``frames/cam00/0000.png``. For a film of one camera
+that moves, row c belongs to the c-th image in ``images``. Layouts: Mildenhall et al., LLFF, 2019; Li et al., Neural
+Scene Flow Fields, CVPR 2021; Li et al., Neural 3D Video Synthesis, CVPR 2022.
 """
 
 from __future__ import annotations
@@ -21,9 +22,10 @@ from ...storage.numpy_files import read_npy
 from ..assemble import FrameRecord, assemble, with_points
 from ..choice import choose, of_cameras
 from ..dataset import Dataset
+from ..held_out import held_out
 from ..images import ReadOptions, size_text
 from ..lens import Lens
-from ..natural_order import natural
+from ..natural_order import by_name, natural
 from ..points import read_points
 from .colmap_images import reduced_folders
 from .colmap_model import find_model
@@ -49,7 +51,8 @@ def recognises(folder: Path) -> bool:
 
 
 def read(folder: Path, split: str, options: ReadOptions) -> Dataset:
-    """Read one split: the first of the chosen cameras is ``test`` and ``val``, the others are ``train``.
+    """Read one split: the first of the chosen cameras is ``test`` and ``val``, the others are ``train``. Of the film of
+    one camera, every eighth image is held out.
 
     All cameras share the same times, which are evenly spaced in the order of the images' names.
 
@@ -58,6 +61,9 @@ def read(folder: Path, split: str, options: ReadOptions) -> Dataset:
     """
     path = folder / FILE
     rows = read_rows(path)
+    film = _film(folder, len(rows))
+    if film:
+        return _read_film(folder, film, rows, split, options)
     cameras, notes = _of_rig(folder, _cameras(folder), len(rows))
     if len(cameras) != len(rows):
         raise UserError(
@@ -67,15 +73,15 @@ def read(folder: Path, split: str, options: ReadOptions) -> Dataset:
     wanted = of_cameras([_label(folder, camera) for camera in cameras], options)
     if len(wanted) < 2:
         raise UserError(f"--only-cameras {options.only_cameras}: name two cameras or more; the first is held out")
-    held_out = wanted[HELD_OUT_CAMERA]
-    chosen = [index for index in wanted if (index == held_out) != (split == "train")]
+    kept_out = wanted[HELD_OUT_CAMERA]
+    chosen = [index for index in wanted if (index == kept_out) != (split == "train")]
     files = _with_gaps([_files(camera) for camera in cameras])
     records = []
     for index in chosen:
-        if len(files[index]) != len(files[held_out]):
+        if len(files[index]) != len(files[kept_out]):
             raise UserError(
-                f"{cameras[index]}: holds {len(files[index])} images, but {_label(folder, cameras[held_out])} "
-                f"{len(files[held_out])}; all cameras need the same instants"
+                f"{cameras[index]}: holds {len(files[index])} images, but {_label(folder, cameras[kept_out])} "
+                f"{len(files[kept_out])}; all cameras need the same instants"
             )
         viewmat = row_viewmat(path, index, rows[index, :15].reshape(3, 5))
         lens = partial(row_lens, path, index, rows[index, :15].reshape(3, 5)[:, 4])
@@ -90,6 +96,33 @@ def read(folder: Path, split: str, options: ReadOptions) -> Dataset:
     data.bounds = _bounds(rows[wanted, 15:])
     points = next((folder / name for name in POINTS if (folder / name).is_file()), None)
     return data if points is None else with_points(data, *read_points(points))
+
+
+def _film(folder: Path, count: int) -> list[Path]:
+    """Return the images of one camera that moves, in the order of the rows; none if there is not one for each row."""
+    files = sorted(_files(folder / "images"), key=lambda p: p.name) if (folder / "images").is_dir() else []
+    return files if len(files) == count else []
+
+
+def _read_film(folder: Path, files: list[Path], rows: np.ndarray, split: str, options: ReadOptions) -> Dataset:
+    """Read a film of one camera: every eighth image is held out; times are evenly spaced in the order of names."""
+    path, ranks = folder / FILE, {index: rank for rank, index in enumerate(by_name(files))}
+    times = [ranks[index] / (len(files) - 1) for index in range(len(files))]
+    choice = choose(path, files, times, options, ["images"] * len(files))
+    order = sorted(choice.indices, key=lambda index: times[index])
+    records = [
+        FrameRecord(
+            files[index],
+            row_viewmat(path, index, rows[index, :15].reshape(3, 5)),
+            choice.times[index],
+            partial(row_lens, path, index, rows[index, :15].reshape(3, 5)[:, 4]),
+            files[index].stem,
+        )
+        for index in held_out(path, order, split)
+    ]
+    data = assemble(records, options, folder=folder, split=split, notes=choice.notes)
+    data.bounds = _bounds(rows[choice.indices, 15:])
+    return data
 
 
 def _bounds(depths: np.ndarray) -> tuple[float, float] | None:

@@ -143,6 +143,22 @@ def test_faults_are_named(tmp_path, fault):
     assert expected in message(tmp_path)
 
 
+@pytest.mark.parametrize("name", ["{:03d}", "frame{}"])
+def test_a_film_of_one_camera(tmp_path, name):
+    """The data of Neural Scene Flow Fields; rows are in the order of LLFF, which puts 10 before 9."""
+    write_poses_bounds(tmp_path, cameras=12, instants=1)
+    rows = np.load(tmp_path / "poses_bounds.npy")
+    (tmp_path / "images").mkdir()
+    names = [name.format(index) for index in range(12)]
+    for index in range(12):
+        (tmp_path / f"cam{index:02d}/images/0000.png").rename(tmp_path / f"images/{names[index]}.png")
+    np.save(tmp_path / "poses_bounds.npy", rows[np.argsort(names)])
+    train, test = load(tmp_path), load(tmp_path, "test")
+    assert share_found(train) > FOUND and share_found(test) > FOUND
+    assert [frame.name for frame in test] == [names[4]] and len(train) == 11
+    assert {frame.name: round(frame.time * 11) for frame in train}[names[10]] == 10 and train.bounds == (1.0, 9.0)
+
+
 def test_images_of_all_cameras_in_one_folder(tmp_path):
     write_poses_bounds(tmp_path)
     for camera in sorted(path for path in tmp_path.iterdir() if path.is_dir()):
