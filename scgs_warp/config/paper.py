@@ -95,6 +95,7 @@ PAPER = TrainConfig(
         network_end=1.6e-6,
         network_until=40_000,
         network_from="stage",
+        network_scale=1.0,
         nodes=8e-4,
         node_positions=8e-5,
         nodes_decay=False,

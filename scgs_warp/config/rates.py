@@ -44,6 +44,10 @@ class OptimConfig:
     network_from: Literal["motion", "stage"] = newer("motion", before="motion")
     """Step from which ``network_until`` counts. motion: the first that trains the network. stage: the first of each
     stage (official code)."""
+    network_scale: float = newer(0.0, before=1.0, least=0, most=1)
+    """Factor on the network's rates. 0: that of the distance at which cameras see the data's initial points, which is 1
+    unless they are close: a step of the network must not move the scene past the cameras
+    (``near_bound.network_scale``)."""
     nodes: float = rate(8e-4)
     """Learning rate of the radii, weights and hyper-coordinates of the control points."""
     node_positions: float = rate(8e-5)

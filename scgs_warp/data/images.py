@@ -295,8 +295,7 @@ def _decoded(path: Path, data: np.ndarray) -> np.ndarray:
 
 
 def instead_of_image(start: bytes, what: str = "image") -> str | None:
-    """Say what a file is that came in place of an image, or of something else, by its first bytes; None for anything
-    else."""
+    """Say what came in place of an image, or of something else, by the file's first bytes; None for other files."""
     if start.startswith(b"version https://git-lfs.github.com"):
         return f"is a pointer of Git LFS, not the {what}; run 'git lfs pull' in its repository"
     if any(mark in start.lower() for mark in (b"<!doctype html", b"<html")):

@@ -41,7 +41,8 @@ def decay_steps(step: int, still: int, optim: OptimConfig) -> int:
 
 def network_rate(step: int, still: int, optim: OptimConfig) -> float:
     """Return the network's learning rate at this step of a stage that trains the network after ``still`` steps."""
-    return log_linear(optim.network, optim.network_end, decay_steps(step, still, optim), optim.network_until)
+    rate = log_linear(optim.network, optim.network_end, decay_steps(step, still, optim), optim.network_until)
+    return rate * (optim.network_scale or 1.0)
 
 
 def moved_by(gaussians: GaussianParameters, means: Tensor, quats: Tensor, log_scales: Tensor) -> Gaussians:

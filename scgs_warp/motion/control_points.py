@@ -330,7 +330,7 @@ class ControlPoints(Motion):
     def rates(self, step: int, config: TrainConfig) -> dict[str, float]:
         optim = config.optim
         network = network_rate(step, config.freeze, optim)
-        decay = network / optim.network if optim.network > 0 else 1.0
+        decay = network / (optim.network * (optim.network_scale or 1.0)) if optim.network > 0 else 1.0
         rates = {name: network for name, _ in self.named_parameters() if name.startswith("network.")}
         positions = optim.node_positions * decay if config.motion.train_positions else 0.0
         nodes = optim.nodes * (decay if optim.nodes_decay else 1.0)

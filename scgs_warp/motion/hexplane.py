@@ -125,7 +125,8 @@ class HexPlane(Motion):
     def rates(self, step: int, config: TrainConfig) -> dict[str, float]:
         optim = config.optim
         decay = log_linear(1.0, 0.01, decay_steps(step, config.coarse, optim), optim.network_until)
+        network = optim.network * (optim.network_scale or 1.0)
         return {
-            name: (optim.planes if name.startswith("planes.") else optim.network) * decay
+            name: (optim.planes if name.startswith("planes.") else network) * decay
             for name, _ in self.named_parameters()
         }

@@ -8,6 +8,8 @@ from ..config.presets import TrainConfig
 from ..data.dataset import Dataset
 from ..geometry.normalisation import FEWEST_POINTS
 from .flow import follow_each_other
+from .near_bound import network_scale
+from .scene_distance import place
 from .second_try_config import may_be_tried_again
 from .silhouettes import is_in_parts, is_thin
 
@@ -27,6 +29,8 @@ def resolve_auto(config: TrainConfig, data: Dataset) -> TrainConfig:
     and much of it is static beside moving surfaces (hyper-coordinates gain 0.55 dB; a motion mask gains 0.2 dB alone,
     and nothing in addition to them). If the data has points, control points start as a sample of them and Gaussians
     start at them (2 dB better than finding both with spheres).
+
+    Where initial points are close to the cameras, the network learns more slowly.
 
     Thin subjects get the pooled residual. Where the subject is in separate parts and silhouettes lead spheres back to
     them, spheres may not fade. Subjects that are not thin may get a second try at stage 1.
@@ -48,6 +52,10 @@ def resolve_auto(config: TrainConfig, data: Dataset) -> TrainConfig:
     if config.pretrain.fade == "auto":
         led = config.pretrain.silhouette > 0 and not thin and is_in_parts(data)
         config = replace(config, pretrain=replace(config.pretrain, fade="never" if led else "always"))
+    if config.optim.network_scale == 0.0:
+        seen = filled and has_initial_points(data, config)
+        scale = network_scale(data, place(data).normalisation) if seen else 1.0
+        config = replace(config, optim=replace(config.optim, network_scale=scale))
     if config.pretrain.arap_by == "auto" and not may_be_tried_again(config, data, thin):
         config = replace(config, pretrain=replace(config.pretrain, arap_by="track"))
     if config.loss.flow > 0.0 and not follow_each_other(data):

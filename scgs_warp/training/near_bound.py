@@ -1,4 +1,5 @@
-"""The distance before every lens within which a capture shows nothing.
+"""How close a scene is to its cameras: the distance before every lens within which a capture shows nothing, and what
+it means for the rates of the network.
 
 A Gaussian close to a lens covers the whole picture of one view, and no other view contradicts it. Densification
 therefore fills the space before isolated cameras with fog, which hides the scene from views that were held out nearby.
@@ -8,9 +9,11 @@ But a camera has moved through that space, and its lens was in focus beyond it.
 from __future__ import annotations
 
 import torch
+from torch import Tensor
 
 from ..data.dataset import Dataset, spread
 from ..geometry.normalisation import COMMON_RADIUS, FEWEST_POINTS, Normalisation
+from ..types import Camera
 
 MOST_VIEWS = 200
 """Largest number of cameras whose distances are measured."""
@@ -23,6 +26,12 @@ INSIDE = 0.1
 the region that all cameras see."""
 
 
+USUAL_DISTANCE = 2.0
+"""Distance, in normalised units, at which a view sees the points of a scene, from which on the network's rates are the
+usual ones. Its first step moves everything by about a tenth of a unit. A film along a street or a floor is seen from a
+quarter of a unit: it was moved behind its cameras, from where no gradient leads back."""
+
+
 def nearest_content(data: Dataset, normalisation: Normalisation) -> float:
     """Return the distance, in normalised units, at which the content of a near view begins: that of the nearest sparse
     points or, without points, of the region that all cameras see; 0 if no view sees enough points."""
@@ -31,8 +40,24 @@ def nearest_content(data: Dataset, normalisation: Normalisation) -> float:
         reach = torch.stack([camera.position.double().norm() for camera in cameras])
         distances = torch.maximum(reach - COMMON_RADIUS, INSIDE * reach)
         return float(distances.quantile(NEAREST_CAMERAS))
-    points = normalisation.apply(data.points).double()
-    found = []
+    found = [distances.quantile(NEAREST_POINTS) for distances in _distances(data, normalisation, cameras)]
+    return float(torch.stack(found).quantile(NEAREST_CAMERAS)) if found else 0.0
+
+
+def network_scale(data: Dataset, normalisation: Normalisation) -> float:
+    """Return the factor on the network's rates that suits the distance at which views see the data's points."""
+    if data.points is None or len(data.points) < FEWEST_POINTS:
+        return 1.0
+    cameras = [normalisation.apply_camera(data.entries[index].camera) for index in spread(len(data), MOST_VIEWS)]
+    found = [distances.median() for distances in _distances(data, normalisation, cameras)]
+    scale = float(torch.stack(found).median()) / USUAL_DISTANCE if found else 1.0
+    return round(min(1.0, scale), 3)  # so that all machines agree
+
+
+def _distances(data: Dataset, normalisation: Normalisation, cameras: list[Camera]) -> list[Tensor]:
+    """Return the distances of the data's points, [P], from each normalised camera that sees enough of them."""
+    assert data.points is not None, "the caller has looked"
+    points, found = normalisation.apply(data.points).double(), []
     for camera in cameras:
         local = points @ camera.viewmat[:3, :3].double().T + camera.viewmat[:3, 3].double()
         local = local[local[:, 2] > 0]
@@ -40,5 +65,5 @@ def nearest_content(data: Dataset, normalisation: Normalisation) -> float:
         pixels = pixels[:, :2] / pixels[:, 2:]
         inside = ((pixels >= 0) & (pixels < pixels.new_tensor([camera.width, camera.height]))).all(1)
         if int(inside.sum()) >= FEWEST_POINTS:
-            found.append(local[inside].norm(dim=1).quantile(NEAREST_POINTS))
-    return float(torch.stack(found).quantile(NEAREST_CAMERAS)) if found else 0.0
+            found.append(local[inside].norm(dim=1))
+    return found

@@ -27,6 +27,7 @@ CHOSEN_BY_THE_DATA = (
     "pretrain.arap_by",
     "pretrain.fade",
     "pretrain.steps",
+    "optim.network_scale",
 )
 """Settings that ``automatic.resolve_auto`` may change, so that they can be compared only when the data is known."""
 

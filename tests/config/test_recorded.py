@@ -66,6 +66,7 @@ def test_best_is_the_former_paper_in_half_the_steps():
         "loss.depth": 0.2,
         "loss.stereo": True,
         "loss.random_background": 0.1,
+        "optim.network_scale": 0.0,
         "motion.bfloat16_adjoint": True,
     }
     assert {name: best[name] for name in best.keys() - values.keys()} == {**newer, **added}

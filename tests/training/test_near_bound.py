@@ -8,12 +8,14 @@ import pytest
 import torch
 
 from helpers.tiny import tiny_config, tiny_dataset
+from scgs_warp.data.dataset import Dataset
 from scgs_warp.geometry.normalisation import COMMON_RADIUS, Normalisation
 from scgs_warp.training import density_control
 from scgs_warp.training.automatic import resolve_auto
 from scgs_warp.training.density_control import visible_gaussians
 from scgs_warp.training.frames import Frames
-from scgs_warp.training.near_bound import nearest_content
+from scgs_warp.training.initial_models import initial_motion
+from scgs_warp.training.near_bound import nearest_content, network_scale
 from scgs_warp.training.state import TrainState
 
 
@@ -98,3 +100,44 @@ def test_cut_out_subjects_are_left_alone():
     assert (resolved.least_views, resolved.clear_distance, resolved.faint_share) == (2, 0.25, 0.0)
     resolved = resolve_auto(config, tiny_dataset(4)).densify
     assert (resolved.least_views, resolved.clear_distance, resolved.faint_share) == (1, 0.0, 0.01)
+
+
+def strip(distance: float) -> Dataset:
+    """A film of a floor, two units long, by a camera that goes along it at a distance."""
+    frames, generator = [], torch.Generator().manual_seed(4)
+    for index, frame in enumerate(filled(9)):
+        viewmat = torch.eye(4)
+        viewmat[:3, 3] = torch.tensor([1.0 - 0.25 * index, 0.0, distance])
+        camera = dataclasses.replace(frame.camera, viewmat=viewmat)
+        frames.append(dataclasses.replace(frame, camera=camera, time=index / 8))
+    points = (torch.rand(4000, 3, generator=generator) - 0.5) * torch.tensor([2.0, 0.5, 0.0])
+    return Dataset(frames, folder=filled(1).folder, split="train", points=points)
+
+
+@pytest.mark.parametrize(("distance", "scale"), [(4.0, 1.0), (2.0, 1.0), (1.0, 0.5), (0.25, 0.125)])
+def test_the_network_learns_more_slowly_close_to_the_cameras(distance, scale):
+    data = strip(distance)
+    normalisation = Normalisation.identity()
+    assert network_scale(data, normalisation) == pytest.approx(scale, rel=0.1)
+
+
+def test_the_data_chooses_the_scale_once():
+    data = strip(0.25)
+    config = tiny_config(60)
+    once = resolve_auto(config, data)
+    assert 0.0 < once.optim.network_scale < 1.0 and resolve_auto(once, data) == once
+    own = dataclasses.replace(config, optim=dataclasses.replace(config.optim, network_scale=1.0))
+    assert resolve_auto(own, data).optim.network_scale == 1.0
+    without = Dataset(data.entries, folder=data.folder, split="train")
+    assert resolve_auto(config, without).optim.network_scale == 1.0, "no points, no distance"
+
+
+def test_the_scale_is_a_factor_on_the_networks_rates_alone():
+    for model in ("control-points", "per-gaussian", "hexplane"):
+        whole = tiny_config(60, motion={"model": model}, optim={"network_scale": 1.0})
+        slow = dataclasses.replace(whole, optim=dataclasses.replace(whole.optim, network_scale=0.25))
+        motion = initial_motion(whole, torch.rand(40, 3))
+        usual, own = motion.rates(20, whole), motion.rates(20, slow)
+        others = ("positions", "log_radii", "hyper", "strength_logits", "planes.")
+        for name, rate in usual.items():
+            assert own[name] == pytest.approx((1.0 if name.startswith(others) else 0.25) * rate), name
