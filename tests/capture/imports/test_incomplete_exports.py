@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-from contextlib import contextmanager
 from pathlib import Path
-from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -12,13 +10,9 @@ import pytest
 
 from helpers.films import mask_images
 from helpers.foreign_scenes import COUNT, WRITERS, write_monst3r, write_polycam
+from helpers.importing import silent
 from scgs_warp.capture import import_scene
 from scgs_warp.capture.source import Folder
-
-
-@contextmanager
-def silent(total: int, text: str):
-    yield SimpleNamespace(advance=lambda count=1: None)
 
 
 def note_of(source: Path, tmp_path: Path) -> str | None:
