@@ -181,7 +181,7 @@ def colors_and_depths(
     tensors = sh_dc.contiguous(), sh_rest.contiguous().view(count * rest, 3), rest, means.contiguous()
     form = _resolve_form(form, sh_dc.device)
     if form == "cpu":
-        position = -(viewmat[:3, :3] * viewmat[:3, 3:]).sum(0)
+        position = -viewmat[:3, :3].T @ viewmat[:3, 3]
         rows = position[None], depths.contiguous(), degree, channels
         launch(cpu_kernels.channels_with_depth, -(-count // LANES), *tensors, *rows, grain=32)
         return channels

@@ -17,9 +17,9 @@ FRAME_OPERATIONS, FRAME_LAUNCHES, FRAME_SORTS = 12, 13, 2
 """In the recorded frame, all motion included; the launches beside those of the sorts."""
 STEP_CONTACTS, STEP_OPERATIONS = 1, 3
 """Of a recorded step, beside the replay."""
-RECORDED_OPERATIONS, RECORDED_LAUNCHES = 110, 48
+RECORDED_OPERATIONS, RECORDED_LAUNCHES = 109, 48
 """In the recorded step. The copies of gradients, one for each parameter here, are few launches on a GPU."""
-ARAP_OPERATIONS, ARAP_LAUNCHES = 119, 53
+ARAP_OPERATIONS, ARAP_LAUNCHES = 118, 53
 """In the recorded step that carries ARAP."""
 
 
