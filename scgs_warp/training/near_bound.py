@@ -27,9 +27,9 @@ the region that all cameras see."""
 
 
 USUAL_DISTANCE = 2.0
-"""Distance, in normalised units, at which a view sees the points of a scene, from which on the network's rates are the
-usual ones. Its first step moves everything by about a tenth of a unit. A film along a street or a floor is seen from a
-quarter of a unit: it was moved behind its cameras, from where no gradient leads back."""
+"""Distance of a scene's points from its cameras, normalised units, from which on the rates are the usual ones.
+The network's first step moves everything by about a tenth of a unit. A street or a floor that is filmed from a quarter
+of a unit would end up behind the cameras, from where no gradient leads back."""
 
 
 def nearest_content(data: Dataset, normalisation: Normalisation) -> float:
