@@ -15,6 +15,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ..runtime.progress import progress
 from ..runtime.search_tree import search_tree
 from ..seeding import generator
 from .flow_points import InstantPoints
@@ -88,18 +89,21 @@ def gather(
     own = first.points.double().numpy()
     spacing = FRESH * float(np.median(search_tree(own).query(own, k=2)[0][:, 1]))
     points, colors, places, weights = [first.points], [first.colors], [tracks.places], [tracks.weights]
-    for number in sorted(range(len(clouds)), key=lambda each: abs(each - start))[1:]:
-        found = followed(number)
-        assert found is not None, "some cloud has tracks"
-        there = found.places[start].double().numpy()
-        apart = search_tree(torch.cat(points).double().numpy()).query(there)[0]
-        fresh = np.flatnonzero((found.weights[start].numpy() > LEAST_SURE) & (apart > spacing))
-        cells = np.floor(there[fresh] / max(spacing, 1e-9)).astype(np.int64)
-        kept = torch.from_numpy(fresh[np.unique(cells, axis=0, return_index=True)[1]])
-        points.append(found.places[start][kept])
-        colors.append(clouds[number].colors[kept])
-        places.append(found.places[:, kept])
-        weights.append(found.weights[:, kept])
+    others = sorted(range(len(clouds)), key=lambda each: abs(each - start))[1:]
+    with progress(len(others), "tracks of what moves") as bar:
+        for number in others:
+            found = followed(number)
+            assert found is not None, "some cloud has tracks"
+            there = found.places[start].double().numpy()
+            apart = search_tree(torch.cat(points).double().numpy()).query(there)[0]
+            fresh = np.flatnonzero((found.weights[start].numpy() > LEAST_SURE) & (apart > spacing))
+            cells = np.floor(there[fresh] / max(spacing, 1e-9)).astype(np.int64)
+            kept = torch.from_numpy(fresh[np.unique(cells, axis=0, return_index=True)[1]])
+            points.append(found.places[start][kept])
+            colors.append(clouds[number].colors[kept])
+            places.append(found.places[:, kept])
+            weights.append(found.weights[:, kept])
+            bar.advance()
     gathered, tracks = torch.cat(points), Tracks(torch.cat(places, 1), torch.cat(weights, 1))
     sure = tracks.weights > LEAST_SURE
     if int(sure.sum(0).max()) < 2:
