@@ -22,13 +22,15 @@ def pack_row(
 
 
 @native_function("network.h")
-def pack_panel(layer: int, panel: int, adjoint: int, table: wp.array2d[wp.int64], packed: wp.array[float]): ...
+def pack_panel(
+    layer: int, panel: int, adjoint: int, table: wp.array2d[wp.int64], packed: wp.array[float], finite: wp.array2d[int],
+): ...
 
 
 @native_function("network.h")
 def network_block(
-    block: int, size: int, keep: int, table: wp.array2d[wp.int64], packed: wp.array[float], inputs: wp.array3d[float],
-    hidden: wp.array3d[float], out: wp.array2d[float],
+    block: int, size: int, keep: int, table: wp.array2d[wp.int64], packed: wp.array[float], finite: wp.array2d[int],
+    inputs: wp.array3d[float], hidden: wp.array3d[float], out: wp.array2d[float],
 ): ...
 
 
@@ -58,10 +60,11 @@ def pack_weights(
     table_in: wp.array2d[wp.int64],  # [L, 9]
     # Out:
     packed_out: wp.array[float],
+    finite_out: wp.array2d[int],  # [L, panels] 1: the weights of this panel of outputs are finite
 ):
     """Pack weights into panels, in the layout that each matrix product of a layer reads. Grid: L x panels."""
     task = first + wp.tid()
-    pack_panel(task // panels, task % panels, adjoint, table_in, packed_out)
+    pack_panel(task // panels, task % panels, adjoint, table_in, packed_out, finite_out)
 
 
 @wp.kernel
@@ -85,10 +88,11 @@ def network_values(
     keep: int,  # 1: hidden has room for every layer, for the adjoint; 0: for two
     table_in: wp.array2d[wp.int64],  # [L, 9]
     packed_in: wp.array[float],
+    finite_in: wp.array2d[int],  # [L, panels]
     inputs_in: wp.array3d[float],  # [panels, R, 32]
     # Out:
     hidden_out: wp.array3d[float],  # [L or 2, R, width], each in panels
     values_out: wp.array2d[float],  # [n, out], n <= R
 ):
     """Evaluate all layers for a block of rows. Grid: blocks."""
-    network_block(first + wp.tid(), size, keep, table_in, packed_in, inputs_in, hidden_out, values_out)
+    network_block(first + wp.tid(), size, keep, table_in, packed_in, finite_in, inputs_in, hidden_out, values_out)

@@ -15,8 +15,8 @@ wp.set_module_options({"enable_backward": False})
 # fmt: off
 @native_function("network_adjoint.h")
 def network_block_adjoint(
-    block: int, size: int, first: int, table: wp.array2d[wp.int64], packed: wp.array[float], hidden: wp.array3d[float],
-    v_out: wp.array2d[float], v_hidden: wp.array3d[float],
+    block: int, size: int, first: int, table: wp.array2d[wp.int64], packed: wp.array[float], finite: wp.array2d[int],
+    hidden: wp.array3d[float], v_out: wp.array2d[float], v_hidden: wp.array3d[float],
 ): ...
 
 
@@ -43,13 +43,16 @@ def network_adjoint(
     begin: int,  # the first of the V rows
     table_in: wp.array2d[wp.int64],  # [L, 9]
     packed_in: wp.array[float],
+    finite_in: wp.array2d[int],  # [L, panels] 1: the weights of this panel of outputs are finite
     hidden_in: wp.array3d[float],  # [L, R, width]
     v_values_in: wp.array2d[float],  # [n, out]
     # Out:
     v_hidden_out: wp.array3d[float],  # [L, V, width] gradient before each layer's ReLU, in panels
 ):
     """Propagate gradients back through all layers for a block of rows. Grid: blocks."""
-    network_block_adjoint(first + wp.tid(), size, begin, table_in, packed_in, hidden_in, v_values_in, v_hidden_out)
+    network_block_adjoint(
+        first + wp.tid(), size, begin, table_in, packed_in, finite_in, hidden_in, v_values_in, v_hidden_out
+    )  # fmt: skip
 
 
 @wp.kernel

@@ -21,8 +21,8 @@ def pack_panel_pairs(layer: int, panel: int, table: wp.array2d[wp.int64], packed
 @native_function("network_pairs.h")
 def network_block_adjoint_pairs(
     block: int, size: int, first: int, tiles: int, table: wp.array2d[wp.int64], packed: wp.array[int],
-    inputs: wp.array3d[float], hidden: wp.array3d[float], v_out: wp.array2d[float], columns: wp.array3d[int],
-    input_rows: wp.array3d[int], hidden_rows: wp.array3d[int], v_rows: wp.array3d[int],
+    finite: wp.array2d[int], inputs: wp.array3d[float], hidden: wp.array3d[float], v_out: wp.array2d[float],
+    columns: wp.array3d[int], input_rows: wp.array3d[int], hidden_rows: wp.array3d[int], v_rows: wp.array3d[int],
 ): ...
 
 
@@ -57,6 +57,7 @@ def network_adjoint_pairs(
     tiles: int,  # whether to use AMX
     table_in: wp.array2d[wp.int64],  # [L, 9]
     packed_in: wp.array[int],
+    finite_in: wp.array2d[int],  # [L, panels] 1: the weights of this panel of outputs are finite; ignored with tiles
     inputs_in: wp.array3d[float],  # [panels, R, 32]
     hidden_in: wp.array3d[float],  # [L, R, width]
     v_values_in: wp.array2d[float],  # [n, out]
@@ -69,7 +70,7 @@ def network_adjoint_pairs(
 ):
     """Propagate gradients back through all layers for a block of rows, and pair the rows. Grid: blocks."""
     network_block_adjoint_pairs(
-        first + wp.tid(), size, begin, tiles, table_in, packed_in, inputs_in, hidden_in, v_values_in,
+        first + wp.tid(), size, begin, tiles, table_in, packed_in, finite_in, inputs_in, hidden_in, v_values_in,
         columns_tmp, input_rows_out, hidden_rows_out, v_rows_out
     )  # fmt: skip
 

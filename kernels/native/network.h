@@ -1,6 +1,7 @@
 // A small multilayer perceptron: packing of its weights and inputs, and its evaluation.
 #pragma once
 #include "network_tiles.h"
+#include "network_zeros.h"
 
 static inline void pair_products(wp::array_t<int>& found) {
 #if defined(__AVX512BF16__)
@@ -10,18 +11,29 @@ static inline void pair_products(wp::array_t<int>& found) {
 #endif
 }
 
+// Return 1 if all numbers are finite.
+static inline int all_finite(const float* numbers, long long count) {
+    int all = 1;
+    for (long long i = 0; i < count; ++i) all &= __builtin_fabsf(numbers[i]) < __builtin_inff();
+    return all;
+}
+
 // Pack one panel of a layer's weights, in the layout that each of its products reads; for the adjoint of the layer
 // before only if asked.
 static inline void pack_panel(
-    int layer, int panel, int adjoint, const wp::array_t<wp::int64>& table, wp::array_t<float>& packed
+    int layer, int panel, int adjoint, const wp::array_t<wp::int64>& table, wp::array_t<float>& packed,
+    wp::array_t<int>& finite
 ) {
     const long long* own = (const long long*)table.data + (long long)layer * TABLE_COLUMNS;
     const float* weights = (const float*)own[WEIGHTS];
     const int in = (int)(own[INPUTS] + own[HIDDEN]), out = (int)own[OUTPUTS];
+    int& own_finite = finite.data[(long long)layer * finite.shape.dims[1] + panel];
+    own_finite = 1;
     if (panel < panels(out)) {  // row k, column j of a panel: weights[j, k]
         float* to = packed.data + own[PACKED] + (long long)panel * in * PANEL;
         const int n = out - panel * PANEL < PANEL ? out - panel * PANEL : PANEL;
         const float* from = weights + (long long)panel * PANEL * in;
+        own_finite = all_finite(from, (long long)n * in);
         for (int k = 0; k < in; ++k)
             for (int j = 0; j < PANEL; ++j) to[k * PANEL + j] = j < n ? from[(long long)j * in + k] : 0.0f;
     }
@@ -64,10 +76,14 @@ static inline void pack_row(
 // Take a block of rows through all layers.
 WHOLE_REGISTERS static inline void network_block(
     int block, int size, int keep, const wp::array_t<wp::int64>& table, const wp::array_t<float>& packed,
-    const wp::array_t<float>& inputs, wp::array_t<float>& hidden, wp::array_t<float>& out
+    const wp::array_t<int>& finite, const wp::array_t<float>& inputs, wp::array_t<float>& hidden,
+    wp::array_t<float>& out
 ) {
     FUSE_WITHIN_EXPRESSIONS
     const auto accumulate = accumulation();
+    const auto accumulate_listed = listed_accumulation();
+    const auto find = columns_of();
+    NonzeroColumns read[BLOCK_TILES];
     const int layers = table.shape.dims[0], rows = hidden.shape.dims[1];
     const int begin = block * size, end = begin + size < rows ? begin + size : rows, count = out.shape.dims[0];
     const int width = hidden.shape.dims[2];
@@ -78,8 +94,19 @@ WHOLE_REGISTERS static inline void network_block(
     struct Half {
         enum { value = 1 };
     };
+    // List the columns that a layer reads of the layer before, for each tile of rows. Return whether that may be done.
+    auto list = [&](int l, int columns) {
+        if (!columns || !may_leave_out(finite, l, columns)) return false;
+        const float* before = hidden.data + plane * (keep ? l - 1 : (l - 1) & 1);
+        for (int i = begin; i < end; i += ROWS)
+            find(
+                read[(i - begin) / ROWS], before + (long long)i * PANEL, (long long)rows * PANEL, panels(columns),
+                Panel()
+            );
+        return true;
+    };
     // Compute a strip of one or two vectors of a layer's outputs, for the rows of the block.
-    auto tile = [&](auto vectors, int l, int p, int c) {
+    auto tile = [&](auto vectors, int l, int p, int c, bool listed) {
         constexpr int V = decltype(vectors)::value;
         const long long* own = (const long long*)table.data + (long long)l * TABLE_COLUMNS;
         const float* bias = (const float*)own[BIAS];
@@ -103,10 +130,14 @@ WHOLE_REGISTERS static inline void network_block(
                 accumulate(acc, inputs.data + (long long)k * rows + (long long)i * PANEL, Panel(), One(), b, n);
                 b += n * PANEL;
             }
-            for (int k = 0; k < from_hidden; k += PANEL) {
-                accumulate(acc, before + (long long)k * rows + (long long)i * PANEL, Panel(), One(), b, PANEL);
-                b += PANEL * PANEL;
-            }
+            const NonzeroColumns& columns = read[(i - begin) / ROWS];
+            if (listed && columns.worth_reading(from_hidden))
+                accumulate_listed(acc, before + (long long)i * PANEL, Panel(), b, columns, Numbers());
+            else
+                for (int k = 0; k < from_hidden; k += PANEL) {
+                    accumulate(acc, before + (long long)k * rows + (long long)i * PANEL, Panel(), One(), b, PANEL);
+                    b += PANEL * PANEL;
+                }
             if (l + 1 < layers) {
                 float* to = after + (long long)p * PANEL * rows + (long long)i * PANEL + c;
                 for (int r = 0; r < ROWS; ++r)
@@ -124,14 +155,15 @@ WHOLE_REGISTERS static inline void network_block(
     };
     for (int l = 0; l < layers; ++l) {
         const int outputs = (int)table.data[(long long)l * TABLE_COLUMNS + OUTPUTS];
+        const bool listed = list(l, (int)table.data[(long long)l * TABLE_COLUMNS + HIDDEN]);
         for (int p = 0; p < panels(outputs); ++p)
             for (int c = 0; c < PANEL; c += STRIP) {
                 if (p * PANEL + c >= outputs) break;
                 // Half a tile is enough for the end of a narrow last layer.
                 if (p * PANEL + c + LANES < outputs)
-                    tile(Full(), l, p, c);
+                    tile(Full(), l, p, c, listed);
                 else
-                    tile(Half(), l, p, c);
+                    tile(Half(), l, p, c, listed);
             }
     }
 }

@@ -2,15 +2,20 @@
 //
 // v_hidden[l] is the gradient of layer l's values before the ReLU, in panels, for the rows from ``first`` on.
 #pragma once
-#include "network_panels.h"
+#include "network_zeros.h"
 
 WHOLE_REGISTERS static inline void network_block_adjoint(
     int block, int size, int first, const wp::array_t<wp::int64>& table, const wp::array_t<float>& packed,
-    const wp::array_t<float>& hidden, const wp::array_t<float>& v_out, wp::array_t<float>& v_hidden
+    const wp::array_t<int>& finite, const wp::array_t<float>& hidden, const wp::array_t<float>& v_out,
+    wp::array_t<float>& v_hidden
 ) {
     FUSE_WITHIN_EXPRESSIONS
     const auto accumulate = accumulation();
-    const int layers = table.shape.dims[0], rows = hidden.shape.dims[1], own_rows = v_hidden.shape.dims[1];
+    const auto accumulate_listed = listed_accumulation();
+    const auto find = columns_of();
+    NonzeroColumns read[BLOCK_TILES];
+    const int layers = table.shape.dims[0], rows = hidden.shape.dims[1];
+    const long long own_rows = v_hidden.shape.dims[1];
     const int count = v_out.shape.dims[0] - first, most = rows - first < own_rows ? rows - first : own_rows;
     const int begin = block * size, end = begin + size < most ? begin + size : most;
     const long long width = hidden.shape.dims[2], plane = rows * width, own_plane = own_rows * width;
@@ -26,6 +31,9 @@ WHOLE_REGISTERS static inline void network_block_adjoint(
         const long long* own = (const long long*)table.data + (long long)l * TABLE_COLUMNS;
         const int reads = (int)own[OUTPUTS];
         const float* from = v_hidden.data + own_plane * l;
+        const bool listed = may_leave_out(finite, l, panels(reads) * PANEL);
+        for (int i = begin; i < end && listed; i += ROWS)
+            find(read[(i - begin) / ROWS], from + (long long)i * PANEL, own_rows * PANEL, panels(reads), Panel());
         for (int p = 0; p < panels(own[HIDDEN]); ++p)
             for (int c = 0; c < PANEL; c += STRIP) {
                 const float* right = packed.data + own[PACKED_ADJOINT] + (long long)p * reads * PANEL + c;
@@ -33,11 +41,16 @@ WHOLE_REGISTERS static inline void network_block_adjoint(
                     vn acc[ROWS][VECTORS];
                     for (int r = 0; r < ROWS; ++r)
                         for (int v = 0; v < VECTORS; ++v) acc[r][v] = vn{};
-                    for (int k = 0; k < reads; k += PANEL) {
-                        const int n = reads - k < PANEL ? reads - k : PANEL;
-                        const float* left = from + (long long)k * own_rows + (long long)i * PANEL;
-                        accumulate(acc, left, Panel(), One(), right + (long long)k * PANEL, n);
-                    }
+                    const NonzeroColumns& columns = read[(i - begin) / ROWS];
+                    if (listed && columns.worth_reading(reads)) {
+                        const float* left = from + (long long)i * PANEL;
+                        accumulate_listed(acc, left, Panel(), right, columns, Numbers());
+                    } else
+                        for (int k = 0; k < reads; k += PANEL) {
+                            const int n = reads - k < PANEL ? reads - k : PANEL;
+                            const float* left = from + (long long)k * own_rows + (long long)i * PANEL;
+                            accumulate(acc, left, Panel(), One(), right + (long long)k * PANEL, n);
+                        }
                     const float* value = hidden.data + plane * (l - 1) + ((long long)p * rows + first + i) * PANEL + c;
                     float* to = v_hidden.data + own_plane * (l - 1) + ((long long)p * own_rows + i) * PANEL + c;
                     for (int r = 0; r < ROWS; ++r)

@@ -5,7 +5,7 @@
 // strip), and paired by rows, as that of the weights does.
 #pragma once
 #include "network_tiles.h"
-#include "simd.h"
+#include "network_zeros.h"
 #include "shuffles.h"
 
 typedef unsigned vp __attribute__((vector_size(LANES * 4)));
@@ -40,6 +40,13 @@ static inline vn add_products(vn sum, vp a, vp b) {
     return first + lower(a) * lower(b);
 #endif
 }
+
+// The products of two pairs, as a type.
+struct Pairs {
+    typedef vp row;
+    typedef vpu unaligned;
+    __attribute__((always_inline)) static vn add(vn sum, unsigned a, vp b) { return add_products(sum, vp{} + a, b); }
+};
 
 // Return a function like ``accumulation`` in network_panels.h for n pairs of both factors.
 static inline auto pair_accumulation() {
@@ -99,10 +106,14 @@ static inline void pack_panel_pairs(
 // inputs for the adjoint of the weights. ``columns`` holds the gradients of two layers.
 WHOLE_REGISTERS static inline void network_block_adjoint_pairs(
     int block, int size, int first, int tiles, const wp::array_t<wp::int64>& table, const wp::array_t<int>& packed,
-    const wp::array_t<float>& inputs, const wp::array_t<float>& hidden, const wp::array_t<float>& v_out,
-    wp::array_t<int>& columns, wp::array_t<int>& input_rows, wp::array_t<int>& hidden_rows, wp::array_t<int>& v_rows
+    const wp::array_t<int>& finite, const wp::array_t<float>& inputs, const wp::array_t<float>& hidden,
+    const wp::array_t<float>& v_out, wp::array_t<int>& columns, wp::array_t<int>& input_rows,
+    wp::array_t<int>& hidden_rows, wp::array_t<int>& v_rows
 ) {
     const auto accumulate = pair_accumulation();
+    const auto accumulate_listed = listed_accumulation();
+    const auto find = columns_of();
+    NonzeroColumns read[BLOCK_TILES];
     const int layers = table.shape.dims[0], rows = hidden.shape.dims[1], own_rows = columns.shape.dims[1];
     const int count = v_out.shape.dims[0] - first, most = rows - first < own_rows ? rows - first : own_rows;
     const int begin = block * size, end = begin + size < most ? begin + size : most, outputs = v_out.shape.dims[1];
@@ -131,11 +142,18 @@ WHOLE_REGISTERS static inline void network_block_adjoint_pairs(
         }
     alignas(64) float zeros[PANEL * PANEL] = {}, products[PANEL * PANEL];
     // Return the gradients of a panel's columns, for ROWS rows from i on, before the ReLU.
-    auto multiply = [&](auto& acc, const unsigned* from, const unsigned* right, int reads, int i) {
+    auto multiply = [&](auto& acc, const unsigned* from, const unsigned* right, int reads, int i, bool listed) {
         for (int r = 0; r < ROWS; ++r)
             for (int v = 0; v < VECTORS; ++v)
                 acc[r][v] = tiles ? *(vnu*)(products + (i - begin + r) * PANEL + v * LANES) : vn{};
-        for (int k = 0; k < reads && !tiles; ++k) {
+        if (tiles) return;
+        const NonzeroColumns& columns = read[(i - begin) / ROWS];
+        if (listed && columns.worth_reading(reads * PAIRS)) {
+            const unsigned* left = from + (long long)i * PAIRS;
+            accumulate_listed(acc, left, HalfPanel(), right, columns, Pairs());
+            return;
+        }
+        for (int k = 0; k < reads; ++k) {
             const unsigned* left = from + ((long long)k * own_rows + i) * PAIRS;
             accumulate(acc, left, HalfPanel(), One(), right + (long long)k * PAIRS * PANEL, PAIRS);
         }
@@ -144,6 +162,11 @@ WHOLE_REGISTERS static inline void network_block_adjoint_pairs(
         const long long* own = (const long long*)table.data + (long long)l * TABLE_COLUMNS;
         const int reads = panels(own[OUTPUTS]);
         const unsigned* from = (unsigned*)columns.data + own_plane * (l & 1);
+        const bool listed = !tiles && may_leave_out(finite, l, reads * PAIRS);
+        for (int i = begin; i < end && listed; i += ROWS)
+            find(
+                read[(i - begin) / ROWS], from + (long long)i * PAIRS, (long long)own_rows * PAIRS, reads, HalfPanel()
+            );
         for (int p = 0; p < panels(own[HIDDEN]); ++p)
             for (int c = 0; c < PANEL; c += STRIP) {
                 const unsigned* right =
@@ -159,7 +182,7 @@ WHOLE_REGISTERS static inline void network_block_adjoint_pairs(
                 }
                 for (int i = begin; i < end; i += ROWS) {
                     vn acc[ROWS][VECTORS], h[ROWS][VECTORS];
-                    multiply(acc, from, right, reads, i);
+                    multiply(acc, from, right, reads, i, listed);
                     const float* value = hidden.data + plane * (l - 1) + ((long long)p * rows + first + i) * PANEL + c;
                     for (int r = 0; r < ROWS; ++r)
                         for (int v = 0; v < VECTORS; ++v) {

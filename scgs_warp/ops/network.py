@@ -115,6 +115,8 @@ class Layers:
         if len(self.pairs):
             launch(kernels_pairs.pack_weight_pairs, *self._tasks(), self.table, self.pairs, grain=1)
         wanted = not self.tiled or (adjoint and not len(self.pairs))
+        self.finite = torch.empty(len(weights), self._widest, dtype=torch.int32)
+        """Whether all weights of a panel are finite: 0 or 1, written with ``packed``."""
         self.packed = self._pack() if wanted else torch.empty(0)
 
     def _tasks(self) -> tuple[int, int]:
@@ -124,7 +126,8 @@ class Layers:
     def _pack(self) -> Tensor:
         """Return the weights packed in float32, with those for the adjoint unless there are pairs."""
         packed = torch.empty(self.layout.packed)
-        launch(kernels.pack_weights, *self._tasks(), int(not len(self.pairs)), self.table, packed, grain=1)
+        adjoint = int(not len(self.pairs))
+        launch(kernels.pack_weights, *self._tasks(), adjoint, self.table, packed, self.finite, grain=1)
         return packed
 
     def values(self, where: Tensor, when: Tensor, keep: bool) -> tuple[Tensor, Tensor, Tensor]:
@@ -139,8 +142,8 @@ class Layers:
             self._values_in_parts(inputs, hidden, out)
             return inputs, hidden, out
         hidden = torch.empty(len(self.weights) if keep else 2, rows, self.panels * NETWORK_PANEL)
-        blocks, size = -(-rows // NETWORK_BLOCK), NETWORK_BLOCK
-        launch(kernels.network_values, blocks, size, int(keep), self.table, self.packed, inputs, hidden, out, grain=1)
+        read = NETWORK_BLOCK, int(keep), self.table, self.packed, self.finite, inputs
+        launch(kernels.network_values, -(-rows // NETWORK_BLOCK), *read, hidden, out, grain=1)
         return inputs, hidden, out
 
     def _values_in_parts(self, inputs: Tensor, hidden: Tensor, out: Tensor) -> None:
@@ -189,7 +192,7 @@ class Layers:
         for begin in range(0, rows, ADJOINT_ROWS_AT_ONCE):
             own = min(ADJOINT_ROWS_AT_ONCE, rows - begin)
             grid, where = -(-own // NETWORK_BLOCK), (NETWORK_BLOCK, begin, table, self.packed)
-            launch(kernels_adjoint.network_adjoint, grid, *where, hidden, v_out, v_hidden, grain=1)
+            launch(kernels_adjoint.network_adjoint, grid, *where, self.finite, hidden, v_out, v_hidden, grain=1)
             if v_inputs is not None:
                 launch(kernels_adjoint.network_inputs_adjoint, grid, *where, v_hidden, v_inputs, grain=1)
             shared = self.panels, TASKS_PER_PANEL, begin, min(own, len(v_out) - begin), table, inputs, hidden, v_hidden
@@ -211,7 +214,7 @@ class Layers:
         )
         for begin in range(0, rows, ADJOINT_ROWS_AT_ONCE):
             own = min(ADJOINT_ROWS_AT_ONCE, rows - begin)
-            read = NETWORK_BLOCK, begin, tiles, table, self.pairs, inputs, hidden, v_out
+            read = NETWORK_BLOCK, begin, tiles, table, self.pairs, self.finite, inputs, hidden, v_out
             pairs = input_rows, hidden_rows, v_rows
             launch(kernels_pairs.network_adjoint_pairs, -(-own // NETWORK_BLOCK), *read, columns, *pairs, grain=1)
             shared = self.panels, TASKS_PER_PANEL, begin, min(own, len(v_out) - begin), tiles, table, *pairs

@@ -2,8 +2,8 @@ from __future__ import annotations
 
 import pytest
 import torch
-from torch import Tensor
 
+from helpers.networks import parameters, rows
 from reference.network import gradients_in_bfloat16
 from reference.network import network as twin
 from scgs_warp.motion import network as motion_network
@@ -18,23 +18,6 @@ SHAPES = [  # inputs of position and time, hidden widths, layers that read the i
     (30, 2, [64, 32, 96], {1, 2}, 40),
     (1, 0, [32], set(), 33),
 ]
-
-
-def parameters(shape: tuple, seed: int) -> tuple[list[Tensor], list[Tensor]]:
-    where, when, widths, skips, out = shape
-    random = torch.Generator().manual_seed(seed)
-    weights, biases, before = [], [], 0
-    for layer, width in enumerate([*widths, out]):
-        columns = before + (where + when if layer == 0 or layer in skips else 0)
-        weights.append((torch.randn(width, columns, generator=random) * (2.0 / columns) ** 0.5).requires_grad_())
-        biases.append((0.1 * torch.randn(width, generator=random)).requires_grad_())
-        before = width
-    return weights, biases
-
-
-def rows(shape: tuple, positions: int, times: int, seed: int) -> tuple[Tensor, Tensor]:
-    random = torch.Generator().manual_seed(seed + 100)
-    return torch.randn(positions, shape[0], generator=random), torch.randn(times, shape[1], generator=random)
 
 
 @pytest.fixture(params=[1, 2], ids=["pairs", "tiles"])
