@@ -28,9 +28,17 @@ def pack_panel(
 
 
 @native_function("network.h")
+def network_block_sums(
+    block: int, size: int, known: int, table: wp.array2d[wp.int64], packed: wp.array[float], inputs: wp.array3d[float],
+    sums: wp.array3d[float],
+): ...
+
+
+@native_function("network.h")
 def network_block(
-    block: int, size: int, keep: int, table: wp.array2d[wp.int64], packed: wp.array[float], finite: wp.array2d[int],
-    inputs: wp.array3d[float], hidden: wp.array3d[float], out: wp.array2d[float],
+    block: int, size: int, keep: int, known: int, table: wp.array2d[wp.int64], packed: wp.array[float],
+    finite: wp.array2d[int], inputs: wp.array3d[float], sums: wp.array3d[float], order: wp.array[int],
+    hidden: wp.array3d[float], out: wp.array2d[float],
 ): ...
 
 
@@ -81,18 +89,40 @@ def pack_inputs(
 
 
 @wp.kernel
+def network_sums(
+    first: int,
+    # In:
+    size: int,  # rows a block
+    known: int,  # columns to sum
+    table_in: wp.array2d[wp.int64],  # [L, 9]
+    packed_in: wp.array[float],
+    inputs_in: wp.array3d[float],  # [panels, R, 32]
+    # Out:
+    sums_out: wp.array3d[float],  # [S, R, width], each in panels; S layers read the inputs
+):
+    """Sum what the first columns of the inputs add to the biases of the layers that read them. Grid: blocks."""
+    network_block_sums(first + wp.tid(), size, known, table_in, packed_in, inputs_in, sums_out)
+
+
+@wp.kernel
 def network_values(
     first: int,
     # In:
     size: int,  # rows a block
     keep: int,  # 1: hidden has room for every layer, for the adjoint; 0: for two
+    known: int,  # columns of the inputs whose sums are in sums_in, or 0
     table_in: wp.array2d[wp.int64],  # [L, 9]
     packed_in: wp.array[float],
     finite_in: wp.array2d[int],  # [L, panels]
-    inputs_in: wp.array3d[float],  # [panels, R, 32]
+    inputs_in: wp.array3d[float],  # [panels, R, 32]; with known columns one row, which all share: [panels, 1, 32]
+    sums_in: wp.array3d[float],  # [S, R, width], touched only with known
+    order_in: wp.array[int],  # [n] row of values_out for each row; empty: the same
     # Out:
     hidden_out: wp.array3d[float],  # [L or 2, R, width], each in panels
     values_out: wp.array2d[float],  # [n, out], n <= R
 ):
     """Evaluate all layers for a block of rows. Grid: blocks."""
-    network_block(first + wp.tid(), size, keep, table_in, packed_in, finite_in, inputs_in, hidden_out, values_out)
+    network_block(
+        first + wp.tid(), size, keep, known, table_in, packed_in, finite_in, inputs_in, sums_in, order_in,
+        hidden_out, values_out
+    )  # fmt: skip

@@ -73,11 +73,62 @@ static inline void pack_row(
     }
 }
 
-// Take a block of rows through all layers.
+// The sum that a tile of a layer's outputs begins with, in each row: the biases.
+static inline auto biases() {
+    return [](auto& start, const long long* layer, int first) {
+        const float* bias = (const float*)layer[BIAS];
+        for (int v = 0; v < (int)(sizeof(start) / sizeof(vn)); ++v)
+            for (int j = 0; j < LANES; ++j) {
+                const int column = first + v * LANES + j;
+                start[v][j] = column < (int)layer[OUTPUTS] ? bias[column] : 0.0f;
+            }
+    };
+}
+
+// Sum, for a block of rows, what the first ``known`` columns of the inputs add to the biases of each layer that reads
+// them.
+WHOLE_REGISTERS static inline void network_block_sums(
+    int block, int size, int known, const wp::array_t<wp::int64>& table, const wp::array_t<float>& packed,
+    const wp::array_t<float>& inputs, wp::array_t<float>& sums
+) {
+    FUSE_WITHIN_EXPRESSIONS
+    const auto accumulate = accumulation();
+    const int rows = inputs.shape.dims[1];
+    const int begin = block * size, end = begin + size < rows ? begin + size : rows;
+    float* to = sums.data;
+    for (int l = 0; l < table.shape.dims[0]; ++l) {
+        const long long* own = (const long long*)table.data + (long long)l * TABLE_COLUMNS;
+        if (!own[INPUTS]) continue;
+        for (int p = 0; p < panels(own[OUTPUTS]); ++p)
+            for (int c = 0; c < PANEL; c += STRIP) {
+                const float* right = packed.data + own[PACKED] + (long long)p * (own[INPUTS] + own[HIDDEN]) * PANEL + c;
+                vn start[VECTORS];
+                biases()(start, own, p * PANEL + c);
+                for (int i = begin; i < end; i += ROWS) {
+                    vn acc[ROWS][VECTORS];
+                    for (int r = 0; r < ROWS; ++r)
+                        for (int v = 0; v < VECTORS; ++v) acc[r][v] = start[v];
+                    for (int k = 0; k < known; k += PANEL) {
+                        const float* left = inputs.data + (long long)k * rows + (long long)i * PANEL;
+                        const int n = known - k < PANEL ? known - k : PANEL;
+                        accumulate(acc, left, Panel(), One(), right + (long long)k * PANEL, n);
+                    }
+                    for (int r = 0; r < ROWS; ++r)
+                        for (int v = 0; v < VECTORS; ++v)
+                            *(vnu*)(to + ((long long)p * rows + i + r) * PANEL + c + v * LANES) = acc[r][v];
+                }
+            }
+        to += (long long)rows * sums.shape.dims[2];
+    }
+}
+
+// Take a block of rows through all layers. If ``known`` is not 0, ``sums`` holds what the first columns of the inputs
+// add, and all rows share the other columns, in the only row of ``inputs``. ``order``, unless it is empty, holds the
+// row of the outputs that a row belongs to.
 WHOLE_REGISTERS static inline void network_block(
-    int block, int size, int keep, const wp::array_t<wp::int64>& table, const wp::array_t<float>& packed,
-    const wp::array_t<int>& finite, const wp::array_t<float>& inputs, wp::array_t<float>& hidden,
-    wp::array_t<float>& out
+    int block, int size, int keep, int known, const wp::array_t<wp::int64>& table, const wp::array_t<float>& packed,
+    const wp::array_t<int>& finite, const wp::array_t<float>& inputs, const wp::array_t<float>& sums,
+    const wp::array_t<int>& order, wp::array_t<float>& hidden, wp::array_t<float>& out
 ) {
     FUSE_WITHIN_EXPRESSIONS
     const auto accumulate = accumulation();
@@ -88,6 +139,9 @@ WHOLE_REGISTERS static inline void network_block(
     const int begin = block * size, end = begin + size < rows ? begin + size : rows, count = out.shape.dims[0];
     const int width = hidden.shape.dims[2];
     const long long plane = (long long)rows * width;
+    struct Shared {
+        enum { value = 0 };
+    };
     struct Full {
         enum { value = VECTORS };
     };
@@ -105,31 +159,40 @@ WHOLE_REGISTERS static inline void network_block(
             );
         return true;
     };
+    // Return the number of layers before l that read the inputs.
+    auto sums_before = [&](int l) {
+        int number = 0;
+        for (int m = 0; m < l; ++m) number += table.data[(long long)m * TABLE_COLUMNS + INPUTS] > 0;
+        return number;
+    };
     // Compute a strip of one or two vectors of a layer's outputs, for the rows of the block.
     auto tile = [&](auto vectors, int l, int p, int c, bool listed) {
         constexpr int V = decltype(vectors)::value;
         const long long* own = (const long long*)table.data + (long long)l * TABLE_COLUMNS;
-        const float* bias = (const float*)own[BIAS];
         const int from_inputs = (int)own[INPUTS], from_hidden = (int)own[HIDDEN], outputs = (int)own[OUTPUTS];
         const float* before = hidden.data + plane * (keep ? l - 1 : (l - 1) & 1);
         float* after = hidden.data + plane * (keep ? l : l & 1);
         const float* right = packed.data + own[PACKED] + (long long)p * (from_inputs + from_hidden) * PANEL + c;
+        const float* known_sums = known && from_inputs ? sums.data + plane * sums_before(l) : nullptr;
         vn start[V];
-        for (int v = 0; v < V; ++v)
-            for (int j = 0; j < LANES; ++j) {
-                const int column = p * PANEL + c + v * LANES + j;
-                start[v][j] = column < outputs ? bias[column] : 0.0f;
-            }
+        biases()(start, own, p * PANEL + c);
         for (int i = begin; i < end; i += ROWS) {
             vn acc[ROWS][V];
             for (int r = 0; r < ROWS; ++r)
-                for (int v = 0; v < V; ++v) acc[r][v] = start[v];
-            const float* b = right;
-            for (int k = 0; k < from_inputs; k += PANEL) {
+                for (int v = 0; v < V; ++v)
+                    acc[r][v] = known_sums
+                                    ? *(const vnu*)(known_sums + ((long long)p * rows + i + r) * PANEL + c + v * LANES)
+                                    : start[v];
+            if (known && from_inputs)
+                accumulate(
+                    acc, inputs.data + known, Shared(), One(), right + (long long)known * PANEL, from_inputs - known
+                );
+            for (int k = 0; k < from_inputs && !known; k += PANEL) {
                 const int n = from_inputs - k < PANEL ? from_inputs - k : PANEL;
-                accumulate(acc, inputs.data + (long long)k * rows + (long long)i * PANEL, Panel(), One(), b, n);
-                b += n * PANEL;
+                const float* left = inputs.data + (long long)k * rows + (long long)i * PANEL;
+                accumulate(acc, left, Panel(), One(), right + (long long)k * PANEL, n);
             }
+            const float* b = right + (long long)from_inputs * PANEL;
             const NonzeroColumns& columns = read[(i - begin) / ROWS];
             if (listed && columns.worth_reading(from_hidden))
                 accumulate_listed(acc, before + (long long)i * PANEL, Panel(), b, columns, Numbers());
@@ -149,7 +212,8 @@ WHOLE_REGISTERS static inline void network_block(
                 for (int v = 0; v < V; ++v)
                     for (int j = 0; j < LANES; ++j) {
                         const int column = p * PANEL + c + v * LANES + j;
-                        if (column < outputs) out.data[(long long)(i + r) * outputs + column] = acc[r][v][j];
+                        const long long row = order.shape.dims[0] ? order.data[i + r] : i + r;
+                        if (column < outputs) out.data[row * outputs + column] = acc[r][v][j];
                     }
         }
     };

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -19,9 +19,11 @@ from ..geometry.normalisation import Normalisation
 from ..kernels import benchmark as kernels
 from ..motion import ControlPoints, HexPlane, PerGaussian, build_motion
 from ..motion.base import Motion
+from ..motion.network import DeformationNetwork, encode, rows_of
 from ..ops.binning import bin_splats
 from ..ops.projection import project
 from ..ops.sampling import farthest_points
+from ..runtime.environment import one_piece
 from ..runtime.launch import launch
 from ..scene.scene import Scene
 from ..seeding import generator
@@ -51,8 +53,13 @@ OPACITY_POWER = 0.45
 OPACITIES = (0.02, 0.95)
 OVERVIEW = Overview((0.0, 0.0, 0.0), (0.0, 0.0, 1.0), 4.0311, math.degrees(0.6911), 15.0, 60.0)
 """Distance and field of view of D-NeRF's cameras."""
-HEAD_WEIGHT = 2e-3
-"""Standard deviation of the last layer's weights: control points move by some hundredths of the figure's height."""
+MOTION = 1e-2
+"""Standard deviation of the network's outputs: control points move by some hundredths of the figure's height."""
+ZEROS = 0.8
+"""Share of hidden values that the ReLU sets to zero: 0.72 to 0.85 in 16 trained networks."""
+SAMPLES = 512
+"""Number of positions at which the network is evaluated to set that share."""
+TIMES = 5
 PLANE_HEAD_WEIGHT = 5e-2
 """Standard deviation of the last layer's weights in the small network of ``hexplane``, whose features are small."""
 HYPER_SPREAD = 0.02
@@ -95,20 +102,36 @@ def figure(count: int, seed: int = SEED, motion: MotionConfig | None = None) -> 
     return made
 
 
-def _loosen(motion: Motion, seed: int) -> None:
-    """Give a model, which starts at rest, small random weights in its last layers (and features that change with time),
-    so that the figure moves a little."""
+@torch.no_grad()
+def _let_move(network: DeformationNetwork, positions: Tensor, random: torch.Generator) -> None:
+    """Give a network, which starts at rest, a small motion, and the share of zeros that trained networks have."""
+    times = torch.linspace(0.0, 1.0, TIMES)[:, None]
+    inputs = rows_of(encode(positions, network.position_frequencies), encode(times, network.time_frequencies))
+    hidden = inputs
+    with one_piece():
+        for index, layer in enumerate(network.layers):
+            if index == network.skip:
+                hidden = torch.cat([inputs, hidden], dim=-1)
+            values = layer(hidden)
+            level = values.flatten().kthvalue(round(ZEROS * values.numel())).values
+            layer.bias -= level
+            hidden = (values - level).relu()
+        weight = torch.randn(network.head.weight.shape, generator=random)
+        network.head.weight.copy_(weight * (MOTION / (hidden @ weight.T).std()))
+
+
+def _loosen(motion: Motion, positions: Tensor, seed: int) -> None:
+    """Let a model move, which starts at rest."""
     random = generator(seed, 2)
-    heads: list[tuple[Any, float]] = []
-    if isinstance(motion, ControlPoints | PerGaussian):
-        heads = [(motion.network.head, HEAD_WEIGHT)]
-    elif isinstance(motion, HexPlane):
-        heads = [(head[-1], PLANE_HEAD_WEIGHT) for head in motion.heads.values()]  # type: ignore[index]
-    with torch.no_grad():
-        for head, weight in heads:
-            head.weight.copy_(weight * torch.randn(head.weight.shape, generator=random))
-        for plane in motion.planes if isinstance(motion, HexPlane) else ():
-            plane.mul_(0.5 + torch.rand(plane.shape, generator=random))
+    if isinstance(motion, ControlPoints | PerGaussian) and isinstance(motion.network, DeformationNetwork):
+        _let_move(motion.network, positions[:SAMPLES], random)
+    if isinstance(motion, HexPlane):
+        with torch.no_grad():
+            for head in motion.heads.values():
+                weight = head[-1].weight  # type: ignore[index]
+                weight.copy_(PLANE_HEAD_WEIGHT * torch.randn(weight.shape, generator=random))
+            for plane in motion.planes:
+                plane.mul_(0.5 + torch.rand(plane.shape, generator=random))
 
 
 def synthetic_scene(motion: str, count: int, nodes: int, device: str, seed: int = SEED) -> Scene:
@@ -124,7 +147,7 @@ def synthetic_scene(motion: str, count: int, nodes: int, device: str, seed: int 
             model.positions.copy_(positions)
             model.hyper.add_(HYPER_SPREAD * torch.randn(model.hyper.shape, generator=generator(seed, 3)))
             model.log_radii.fill_(math.log(float(neighbor_distance(positions).median())))
-    _loosen(model, seed)
+    _loosen(model, model.positions if isinstance(model, ControlPoints) else gaussians.means, seed)
     scene = Scene(gaussians.to(device), model.to(device), Normalisation.identity(), config, OVERVIEW)
     scene.motion.eval()  # Loaded scenes are in evaluation mode, too, where some models cache.
     scene.freeze_binding()

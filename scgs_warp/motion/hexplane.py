@@ -10,7 +10,8 @@ from torch import Tensor, nn
 
 from ..config.presets import TrainConfig
 from ..gaussians import GaussianParameters
-from ..ops.network import Layers, PackedLayers, evaluate, network
+from ..ops.network import Layers, evaluate, network
+from ..ops.network_cache import NetworkCache
 from ..ops.planes import CHANNELS, PAIRS, Smoothness, plane_features, plane_variation
 from ..optim import log_linear
 from ..seeding import Purpose, generator
@@ -63,7 +64,7 @@ class HexPlane(Motion):
         for head in self.heads.values():
             last = head[-1]  # type: ignore[index]
             nn.init.normal_(last.weight, std=1e-4, generator=random)
-        self._packed = PackedLayers()
+        self._cache = NetworkCache()
 
     def features(self, positions: Tensor, time: float | Tensor) -> Tensor:
         """Return features [N, 64], products of bilinear samples. Positions outside the cube take the value at its
@@ -93,7 +94,7 @@ class HexPlane(Motion):
         return TrainingPose(self.gaussians_at(gaussians, times[:1]), variation)
 
     def train(self, mode: bool = True) -> HexPlane:
-        self._packed.forget()  # the optimiser writes without raising torch's version counters
+        self._cache.forget()  # the optimiser writes without raising torch's version counters
         return super().train(mode)
 
     def _moved(self, gaussians: GaussianParameters, features: Tensor) -> Gaussians:
@@ -109,7 +110,7 @@ class HexPlane(Motion):
         if self.training or torch.is_grad_enabled():
             return network(features, when, *self._layers())
         parameters = (p for module in (self.trunk, self.heads) for p in module.parameters())
-        packed = self._packed(parameters, lambda: Layers(*self._layers(), features.shape[1]))
+        packed = self._cache.layers(parameters, lambda: Layers(*self._layers(), features.shape[1]))
         return evaluate(packed, features, when)
 
     def _layers(self) -> tuple[list[Tensor], list[Tensor]]:

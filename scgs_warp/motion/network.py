@@ -9,7 +9,8 @@ import torch
 from torch import Tensor, nn
 
 from ..ops.encoding import encode_rows
-from ..ops.network import Layers, PackedLayers, evaluate, network, pair_products, supported
+from ..ops.network import ROWS_AT_ONCE, Layers, evaluate, network, pair_products, supported
+from ..ops.network_cache import NetworkCache
 from ..runtime.environment import one_piece
 
 
@@ -92,10 +93,10 @@ class DeformationNetwork(nn.Module):
         self.head = nn.Linear(width, sum(heads.values()))
         nn.init.normal_(self.head.weight, std=1e-5, generator=generator)
         nn.init.zeros_(self.head.bias)
-        self._packed = PackedLayers()
+        self._cache = NetworkCache()
 
     def train(self, mode: bool = True) -> DeformationNetwork:
-        self._packed.forget()  # the optimiser writes without raising torch's version counters
+        self._cache.forget()  # the optimiser writes without raising torch's version counters
         return super().train(mode)
 
     def forward(self, positions: Tensor, times: Tensor) -> dict[str, Tensor]:
@@ -116,11 +117,9 @@ class DeformationNetwork(nn.Module):
             inputs = encode_rows(positions, times, self.position_frequencies, self.time_frequencies)
             out = self._layered(inputs)
         else:
-            where = encode(positions, self.position_frequencies)
-            when = encode(times[:, None], self.time_frequencies)
-            out = self._fused(where, when)
+            out = self._fused(positions, times)
             if out is None:
-                out = self._layered(rows_of(where, when))
+                out = self._layered(rows_of(self._where(positions), self._when(times)))
         return out.reshape(times.shape[0], positions.shape[0], -1)
 
     def _layered(self, inputs: Tensor) -> Tensor:
@@ -144,17 +143,34 @@ class DeformationNetwork(nn.Module):
             return fused(layer.bias, inputs, layer.weight.T)
         return layer(inputs).relu()
 
-    def _fused(self, where: Tensor, when: Tensor) -> Tensor | None:
+    def _where(self, positions: Tensor) -> Tensor:
+        return encode(positions, self.position_frequencies)
+
+    def _when(self, times: Tensor) -> Tensor:
+        return encode(times[:, None], self.time_frequencies)
+
+    def _fused(self, positions: Tensor, times: Tensor) -> Tensor | None:
         """Evaluate all layers in one kernel; return None if no kernel fits them."""
         layers = [cast(nn.Linear, layer) for layer in (*self.layers, self.head)]
         weights: list[Tensor] = [layer.weight for layer in layers]
         biases: list[Tensor] = [layer.bias for layer in layers]
-        wants_inputs = where.requires_grad or when.requires_grad
+        wants_inputs = positions.requires_grad or times.requires_grad
         if (self.low_precision and self.training) or wants_inputs or not supported(weights, biases):
             return None
         if self.training or torch.is_grad_enabled():
             rounded = self.low_precision_adjoint and pair_products() > 0
-            return network(where, when, weights, biases, bfloat16=rounded)
-        columns = where.shape[1] + when.shape[1]
-        packed = self._packed((*weights, *biases), lambda: Layers(weights, biases, columns))
-        return evaluate(packed, where, when)
+            return network(self._where(positions), self._when(times), weights, biases, bfloat16=rounded)
+        return self._without_gradients(positions, times, weights, biases)
+
+    def _without_gradients(
+        self, positions: Tensor, times: Tensor, weights: list[Tensor], biases: list[Tensor]
+    ) -> Tensor:
+        """Evaluate with what earlier evaluations left in the cache."""
+        when = self._when(times)
+        columns = 3 * (1 + 2 * self.position_frequencies) + when.shape[1]
+        layers = self._cache.layers((*weights, *biases), lambda: Layers(weights, biases, columns))
+        if len(times) == 1 and len(positions) <= ROWS_AT_ONCE and not layers.tiled:
+            sums = self._cache.position_sums(layers, positions, self._where)
+            if sums is not None:
+                return layers.values_at(sums, when)
+        return evaluate(layers, self._where(positions), when)

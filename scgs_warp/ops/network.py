@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -76,6 +75,21 @@ def _layout(shapes: tuple[tuple[int, int], ...], inputs: int, inputs_adjoint: bo
     return Layout(np.array(rows, np.int64), at, begins, sizes)
 
 
+class PositionSums(NamedTuple):
+    """What fixed positions contribute to the layers that read the inputs, at every time."""
+
+    columns: int
+    """Number of inputs that depend on the position."""
+    sums: Tensor
+    """[layers that read the inputs, rows, width] the biases and the products of these inputs, in panels."""
+    order: Tensor
+    """[M] int32, the position of each row. Neighbours in space are often zero together, and a tile of rows leaves out
+    what is zero in all of them."""
+
+
+NO_ORDER = torch.empty(0, dtype=torch.int32)
+
+
 class Layers:
     """Weights of all layers, packed in the kernels' layout where they are needed so; valid until a parameter changes.
 
@@ -142,9 +156,36 @@ class Layers:
             self._values_in_parts(inputs, hidden, out)
             return inputs, hidden, out
         hidden = torch.empty(len(self.weights) if keep else 2, rows, self.panels * NETWORK_PANEL)
-        read = NETWORK_BLOCK, int(keep), self.table, self.packed, self.finite, inputs
+        read = NETWORK_BLOCK, int(keep), 0, self.table, self.packed, self.finite, inputs, None, NO_ORDER
         launch(kernels.network_values, -(-rows // NETWORK_BLOCK), *read, hidden, out, grain=1)
         return inputs, hidden, out
+
+    def position_sums(self, where: Tensor, order: Tensor) -> PositionSums:
+        """Sum what positions contribute at every time; not on a processor with tiles.
+
+        Args:
+            where: [M, A] inputs that depend on the position, M > 0.
+            order: [M] int32, the position of each row.
+        """
+        rows = -(-len(where) // ROW_MULTIPLE) * ROW_MULTIPLE
+        inputs = torch.zeros(-(-self.inputs // NETWORK_PANEL), rows, NETWORK_PANEL)
+        launch(kernels.pack_inputs, rows, where[order.long()], torch.zeros(1, self.inputs - where.shape[1]), inputs)
+        readers = int((self.layout.table[:, 2] > 0).sum())
+        sums = torch.empty(readers, rows, self.panels * NETWORK_PANEL)
+        read = NETWORK_BLOCK, where.shape[1], self.table, self.packed, inputs
+        launch(kernels.network_sums, -(-rows // NETWORK_BLOCK), *read, sums, grain=1)
+        return PositionSums(where.shape[1], sums, order)
+
+    def values_at(self, positions: PositionSums, when: Tensor) -> Tensor:
+        """Return the outputs [M, out] for all positions at one time, given its inputs [1, B]: the same bits as
+        :meth:`values`."""
+        inputs = torch.zeros(-(-self.inputs // NETWORK_PANEL), 1, NETWORK_PANEL)
+        inputs.view(-1)[positions.columns : self.inputs] = when[0]
+        rows, width = positions.sums.shape[1:]
+        hidden, out = torch.empty(2, rows, width), torch.empty(len(positions.order), self.outputs)
+        read = NETWORK_BLOCK, 0, positions.columns, self.table, self.packed, self.finite, inputs, *positions[1:]
+        launch(kernels.network_values, -(-rows // NETWORK_BLOCK), *read, hidden, out, grain=1)
+        return out
 
     def _values_in_parts(self, inputs: Tensor, hidden: Tensor, out: Tensor) -> None:
         """Write the outputs, and the hidden values if ``hidden`` has room for them."""
@@ -232,30 +273,6 @@ def _over_times(v_inputs: Tensor, positions: int, times: int, columns: int) -> T
     for own in instants[1:]:
         total += own
     return total
-
-
-class PackedLayers:
-    """Cache of packed weights, valid until a parameter is replaced or changed in place.
-
-    The cache does not notice changes that torch does not count (edits through ``.data``, writes of other libraries).
-    Call :meth:`forget` after such changes.
-    """
-
-    def __init__(self) -> None:
-        self._kept: tuple[list[tuple[int, int]], Layers] | None = None
-
-    def forget(self) -> None:
-        self._kept = None
-
-    def __call__(self, parameters: Iterable[Tensor], make: Callable[[], Layers]) -> Layers:
-        """Return the packed layers; call ``make`` to pack ``parameters`` if the cache is out of date."""
-        parameters = list(parameters)
-        if any(p.is_inference() for p in parameters):  # torch does not count changes of inference tensors
-            return make()
-        key, kept = [(p.data_ptr(), p._version) for p in parameters], self._kept
-        if kept is None or kept[0] != key:
-            kept = self._kept = key, make()
-        return kept[1]
 
 
 class _Network(torch.autograd.Function):
