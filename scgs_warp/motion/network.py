@@ -120,7 +120,7 @@ class DeformationNetwork(nn.Module):
             out = self._fused(positions, times)
             if out is None:
                 out = self._layered(rows_of(self._where(positions), self._when(times)))
-        return out.reshape(times.shape[0], positions.shape[0], -1)
+        return out.reshape(times.shape[0], positions.shape[0], out.shape[-1])
 
     def _layered(self, inputs: Tensor) -> Tensor:
         """Evaluate [N, in] layer by layer in torch: used on CUDA, in bfloat16, and if positions or times need a
@@ -154,7 +154,7 @@ class DeformationNetwork(nn.Module):
         layers = [cast(nn.Linear, layer) for layer in (*self.layers, self.head)]
         weights: list[Tensor] = [layer.weight for layer in layers]
         biases: list[Tensor] = [layer.bias for layer in layers]
-        wants_inputs = positions.requires_grad or times.requires_grad
+        wants_inputs = torch.is_grad_enabled() and (positions.requires_grad or times.requires_grad)
         if (self.low_precision and self.training) or wants_inputs or not supported(weights, biases):
             return None
         if self.training or torch.is_grad_enabled():
