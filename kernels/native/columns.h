@@ -12,9 +12,17 @@ ALWAYS_INLINE const void* read_rows(const void* from, int rows, int row_bytes, v
     return spare;
 }
 
+// Prefetch the rows of the next block: a thread's blocks follow one another, in more streams than the processor follows
+// by itself.
+ALWAYS_INLINE void prefetch_next(const void* data, int begin, int width) {
+    const float* next = (const float*)data + (begin + 16ll) * width;
+    for (int line = 0; line < width; ++line) __builtin_prefetch(next + 16 * line);
+}
+
 // Load rows begin to begin + rows - 1 of an array of vectors of `width` floats (2, 3 or 4) as columns.
 ALWAYS_INLINE void read_vectors(const void* data, int begin, int rows, int width, vf* to) {
     float spare[64];
+    prefetch_next(data, begin, width);
     const float* first = (const float*)data + (long long)begin * width;
     const float* from = (const float*)read_rows(first, rows, 4 * width, spare);
     vf a[4];
@@ -30,6 +38,7 @@ ALWAYS_INLINE void read_vectors(const void* data, int begin, int rows, int width
 // Write columns as rows begin to begin + rows - 1 of an array of vectors of `width` floats.
 ALWAYS_INLINE void write_vectors(void* data, int begin, int rows, int width, const vf* from) {
     vf a[4];
+    prefetch_next(data, begin, width);
     if (width == 4)
         join4(from, a);
     else if (width == 3)
@@ -37,12 +46,6 @@ ALWAYS_INLINE void write_vectors(void* data, int begin, int rows, int width, con
     else
         join2(from, a);
     __builtin_memcpy((float*)data + (long long)begin * width, a, rows == 16 ? 64 * width : 4 * width * rows);
-}
-
-// Prefetch the rows of the next block: a thread's blocks follow one another.
-ALWAYS_INLINE void prefetch_next(const float* data, int begin, int width) {
-    const float* next = data + (begin + 16ll) * width;
-    for (int line = 0; line < width; ++line) __builtin_prefetch(next + 16 * line);
 }
 
 // Read 16 columns, from column `from` on, of the rows of an array of `size` floats. Lanes past the last row are zeros;

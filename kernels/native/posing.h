@@ -21,6 +21,8 @@ static inline void pose_block(
         float spare_weights[16 * MAX_NEIGHBORS];
         read_vectors(means.data, begin, rows, 3, x);
         read_vectors(quats.data, begin, rows, 4, rest);
+        prefetch_next(indices.data, begin, K);
+        prefetch_next(weights.data, begin, K);
         const int* pick = (const int*)read_rows(indices.data + (long long)begin * K, rows, 4 * K, spare_picks);
         const float* weight = (const float*)read_rows(weights.data + (long long)begin * K, rows, 4 * K, spare_weights);
         if (!aligned) weight_columns(weight, K, columns);

@@ -11,6 +11,7 @@ struct Gain {
         FUSE_WITHIN_EXPRESSIONS
         vf G[16];
         for (int k = 0; k < 9; ++k) turn[k] = since_rest[k];
+        prefetch_next(shading.data, begin, 10);
         read_columns(shading.data, 10ll * shading.shape[0], begin, rows, 10, 0, G);
         x = G[0] * turn[0];
         for (int k = 1; k < 9; ++k) x = x + G[k] * turn[k];
