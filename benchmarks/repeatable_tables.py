@@ -14,7 +14,8 @@ and without ``--nodes 4096``), that of meshes from ``results/mesh-distance.json`
 of masks from ``results/mask-edges.json`` (``mask_edges.py``), that of optical flow from ``results/optical-flow.json``
 (``optical_flow.py``), those of a filmed room from ``results/filmed-room.json`` (``filmed_room.py``), that of means from
 ``results/mean-of-runs.json`` (``mean_of_runs.py``), that of long films from ``results/long-film-memory.json``
-(``long_film.py memory``). Those of pages come from ``results/page-million.json`` (``page_frames.py``) and
+(``long_film.py memory``), that of zeros in ``docs/benchmarks.md`` from ``results/network-zeros.json``
+(``network_zeros.py``). Those of pages come from ``results/page-million.json`` (``page_frames.py``) and
 ``results/live-cost.json`` (``live_cost.py``), and that of soaks from ``results/chaos-PART.json`` (``chaos.py --part
 PART --minutes 118``).
 """
@@ -216,6 +217,22 @@ def soaks(results: Results) -> str:
     return table(["work", "time", "rounds", "of them with a fault", "invariants broken"], lines)
 
 
+def network_zeros(results: Results) -> str:
+    """Write how many hidden values of trained networks, and of the synthetic scene's, are zero."""
+    rows = results["network-zeros"]["rows"]
+    trained, made = rows[:-1], rows[-1]
+
+    def span(key: str) -> str:
+        values = [row[key] for row in trained]
+        return f"{100 * min(values):.0f} to {100 * max(values):.0f} %"
+
+    lines = [
+        ["hidden values that are zero", span("zeros"), f"{100 * made['zeros']:.0f} %"],
+        ["columns that are zero in eight rows", span("columns"), f"{100 * made['columns']:.0f} %"],
+    ]
+    return table(["", f"{len(trained)} trained networks", "synthetic scene"], lines)
+
+
 class Repeatable(NamedTuple):
     """A table, the names of its results, and the folders with the code that they measure."""
 
@@ -254,6 +271,7 @@ REPEATABLE = {
     "trust-soaks": Repeatable(
         soaks, tuple(f"chaos-{part}" for part in SOAKS), ("scgs_warp/storage", "scgs_warp/editor", "scgs_warp/live")
     ),
+    "network-zeros": Repeatable(network_zeros, ("network-zeros",), ("scgs_warp/benchmark/scenes.py",)),
     "quality-mean-of-runs": Repeatable(mean_of_runs, ("mean-of-runs",), TRAINING),
     "editing-updates": Repeatable(edit_updates, ("edit-cpu", "edit-4096-cpu"), EDITING),
 }

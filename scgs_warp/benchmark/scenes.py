@@ -56,7 +56,7 @@ OVERVIEW = Overview((0.0, 0.0, 0.0), (0.0, 0.0, 1.0), 4.0311, math.degrees(0.691
 MOTION = 1e-2
 """Standard deviation of the network's outputs: control points move by some hundredths of the figure's height."""
 ZEROS = 0.8
-"""Share of hidden values that the ReLU sets to zero: 0.72 to 0.85 in 16 trained networks."""
+"""Share of hidden values that the ReLU sets to zero, as in trained networks (``benchmarks/network_zeros.py``)."""
 SAMPLES = 512
 """Number of positions at which the network is evaluated to set that share."""
 TIMES = 5
