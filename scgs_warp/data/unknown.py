@@ -12,7 +12,7 @@ from .readers.transforms import SUFFIXES as IMAGES
 
 FILMS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".mts", ".m2ts", ".3gp", ".wmv")
 VIDEOS = (*FILMS, ".gif")
-ARCHIVES = (".zip", ".r3d", ".tar", ".gz", ".tgz", ".bz2", ".xz", ".7z", ".rar", ".zst")
+ARCHIVES = (".zip", ".tar", ".gz", ".tgz", ".bz2", ".xz", ".7z", ".rar", ".zst")
 SPLATS = (".ply", ".splat", ".spz", ".sog", ".ksplat")
 DEEPEST, MOST_FOLDERS = 3, 200
 """Depth to which, and number of folders in which, a data set is looked for."""
@@ -35,6 +35,11 @@ def not_a_folder(path: Path) -> UserError:
     if suffix in VIDEOS:
         return UserError(
             f"{path}: a video has no cameras yet; find them with: scgs-warp capture {shell_words(path)} --output "
+            f"{shell_words(f'data/{path.stem}')}"
+        )
+    if suffix == ".r3d":
+        return UserError(
+            f"{path}: a recording of Record3D; import it with: scgs-warp capture --poses {shell_words(path)} --output "
             f"{shell_words(f'data/{path.stem}')}"
         )
     if suffix in ARCHIVES:

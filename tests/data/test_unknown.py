@@ -30,7 +30,7 @@ def said(path: Path) -> str:
         ("one.jpg", "is one image"),
         ("notes", "is a file"),
         ("scene.npz", "scgs-warp capture --poses {path} --output data/scene"),
-        ("take.r3d", "unpack it"),
+        ("take.r3d", "scgs-warp capture --poses {path} --output data/take"),
     ],
 )
 def test_files(name, expected, tmp_path):

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import shutil
-from collections.abc import Callable
-from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -25,11 +23,11 @@ from ...visualization.video import write_png
 from ..similarity import Similarity, upright
 from ..source import read_rgb
 from . import agreement, arrays, monst3r, phone_apps
+from .archives import ShowProgress, unpacked
 from .depth_writing import DepthWriter, checked_depth, known_depth
 from .scene import MAX_NUMBER, OPENGL_TO_OPENCV, ImportedFrame, ImportedScene
 
 FILE, POINTS = "transforms.json", "points.ply"
-ARCHIVES = (".zip", ".r3d", ".tar", ".gz", ".7z")
 MIN_FRAMES = 2
 POINT_FRAMES = 24
 """Number of frames whose depth gives points."""
@@ -38,8 +36,6 @@ POINT_COUNT = 40_000
 
 MAX_MOMENT = 1e19
 """Largest time of a frame, in the unit of the file: microseconds since 1970 are below it."""
-
-ShowProgress = Callable[[int, str], AbstractContextManager[Any]]
 
 
 class ImportResult(NamedTuple):
@@ -73,16 +69,16 @@ def read_scene(path: Path) -> ImportedScene:
                 return read(path)
         if (path / FILE).is_file():
             raise UserError(f"--poses {path}: is in nerfstudio's layout already; python apps/train.py --data {path}")
-    if path.is_file() and path.suffix.lower() in ARCHIVES:
-        raise UserError(f"--poses {path}: is an archive; unpack it, and give the folder")
     raise UserError(
         f"--poses {path}: is no scene of MegaSaM, VGGT or Depth Anything 3 (.npz), MonST3R ({monst3r.TRAJECTORY}), "
-        "Polycam (keyframes), Record3D (metadata.json, rgb) or 3D Scanner App (frame_00000.json); export one of these"
+        "Polycam (keyframes), Record3D (.r3d; metadata.json, rgb) or 3D Scanner App (frame_00000.json); export one of "
+        "these"
     )
 
 
 def import_scene(path: Path, folder: Path, show: ShowProgress = progress) -> ImportResult:
-    """Make a data set of the scene at ``path``. The folder appears when it is complete.
+    """Make a data set of the scene at ``path``, a folder, a file or a zip archive. The folder appears when it is
+    complete.
 
     Args:
         folder: must not exist, or be empty.
@@ -93,7 +89,12 @@ def import_scene(path: Path, folder: Path, show: ShowProgress = progress) -> Imp
     """
     if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
         raise UserError(f"{folder}: exists and holds something else; give another --output, or remove it")
-    scene = read_scene(path)
+    with unpacked(path, folder, show) as place:
+        return _import(read_scene(place), place, folder, show)
+
+
+def _import(scene: ImportedScene, path: Path, folder: Path, show: ShowProgress) -> ImportResult:
+    """Write the data set of a scene that was read from ``path``."""
     if len(scene.frames) < MIN_FRAMES:
         raise UserError(f"{path}: has {len(scene.frames)} frames with an image, but two are needed; export it again")
     latest = max(abs(frame.moment) for frame in scene.frames)

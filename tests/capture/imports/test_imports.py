@@ -263,7 +263,7 @@ def test_malformed_folders(tmp_path):
     (tmp_path / "empty").mkdir()
     refused(tmp_path / "empty", tmp_path, "is no scene of MegaSaM, VGGT")
     (tmp_path / "capture.r3d").write_bytes(b"PK")
-    refused(tmp_path / "capture.r3d", tmp_path, "is an archive; unpack it")
+    refused(tmp_path / "capture.r3d", tmp_path, "no zip archive, or a damaged one")
     refused(tmp_path / "none", tmp_path, "no such file or folder")
     (tmp_path / "studio").mkdir()
     (tmp_path / "studio/transforms.json").write_text("{}")
