@@ -38,6 +38,23 @@ def test_synthetic_scenes_repeat_and_move_mildly(motion):
         assert [layer.out_features for layer in layers[:8]] == [256] * 8
 
 
+@pytest.mark.parametrize("motion", ["control-points", "per-gaussian"])
+def test_as_many_hidden_values_are_zero_as_in_trained_networks(motion):
+    """The kernels of the CPU leave out products with zeros."""
+    scene = scenes.synthetic_scene(motion, 400, 40, "cpu")
+    positions = scene.motion.positions if motion == "control-points" else scene.gaussians.means
+    shares: list[float] = []
+    hooks = [
+        layer.register_forward_hook(lambda module, given, out: shares.append(float((out <= 0).float().mean())))
+        for layer in scene.motion.network.layers
+    ]
+    for time in (0.1, 0.6):
+        scene.motion.network(positions.detach().requires_grad_(), torch.tensor([time]))
+    for hook in hooks:
+        hook.remove()
+    assert len(shares) == 16 and 0.75 < sum(shares) / 16 < 0.85 and max(shares) < 0.95
+
+
 @pytest.mark.parametrize("seed", range(3))
 def test_contributors_are_those_that_compositing_blends(seed, device):
     """A channel of ones over alpha * T hides the count; twin: every splat on its own, in the order of depth."""
