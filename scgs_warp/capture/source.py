@@ -19,6 +19,7 @@ from ..data.name_times import moments_in_names
 from ..data.orientation import TURNS, read_orientation, upright
 from ..errors import UserError
 from ..storage.files import open_regular
+from ..storage.heif_files import heif_orientation, heif_size, is_heif, read_heif
 from . import cut_out
 from .animation import Animation, is_animation
 from .as_shown import picture
@@ -244,7 +245,7 @@ class Folder:
     @cached_property
     def _usual(self) -> Path:
         """First image of the size, as displayed, that most have."""
-        sizes = [tuple(header_sizes(file)[-1:]) for file in self.files]
+        sizes = [(heif_size(file),) if is_heif(file) else tuple(header_sizes(file)[-1:]) for file in self.files]
         return self.files[sizes.index(Counter(sizes).most_common(1)[0][0])]
 
     def digest(self, earlier: bool = False) -> str:
@@ -255,7 +256,8 @@ class Folder:
 
 def turns_of(file: Path) -> int:
     """Return the number of quarter turns, counter-clockwise, by which viewers turn a photograph."""
-    return TURNS.get(read_orientation(_bytes_of(file).data), (0, False))[0]
+    orientation = heif_orientation(file) if is_heif(file) else read_orientation(_bytes_of(file).data)
+    return TURNS.get(orientation, (0, False))[0]
 
 
 def _moments(names: list[str]) -> list[float]:
@@ -270,12 +272,17 @@ def _moments(names: list[str]) -> list[float]:
 
 def read_rgb(file: Path) -> np.ndarray:
     """Read [H, W, 3] uint8 RGB, rotated by its EXIF tags; raise UserError if the file is not an image."""
+    if is_heif(file):
+        return np.ascontiguousarray(read_heif(file)[..., :3])
     return cv2.cvtColor(read_image(file, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB)
 
 
 def read_cut_out(file: Path) -> tuple[np.ndarray, np.ndarray | None]:
     """Read an image as ``read_rgb`` does, and its alpha [H, W] uint8, None if all is opaque; what alpha hides is
     black."""
+    if is_heif(file):
+        pixels = read_heif(file)
+        return (pixels, None) if pixels.shape[2] == 3 else cut_out.split(pixels)
     image = read_rgb(file)
     whole = None if file.suffix.lower() in OPAQUE_SUFFIXES else read_image(file, cv2.IMREAD_UNCHANGED)
     if whole is None or whole.ndim != 3 or whole.shape[2] != 4 or whole.dtype.kind != "u":

@@ -15,6 +15,7 @@ from scgs_warp.capture.folder_content import photographs_left_out
 from scgs_warp.capture.rig.instants import frame_seconds
 from scgs_warp.capture.source import Folder, Video, open_source
 from scgs_warp.errors import UserError
+from scgs_warp.storage import heif_files
 from scgs_warp.visualization.video import film, write_png
 
 
@@ -191,9 +192,15 @@ def test_files_that_are_hidden_are_no_images(tmp_path):
     assert [file.name for file in Folder(tmp_path).files] == ["1.png", "2.png"]
 
 
-def test_folders_without_images_say_what_they_hold(tmp_path):
+@pytest.fixture
+def without_heif(monkeypatch):
+    monkeypatch.setattr(heif_files, "reads_heif", lambda: False)
+
+
+def test_folders_without_images_say_what_they_hold(tmp_path, without_heif):
     for name, files, said in (
-        ("phone", ["IMG_1.HEIC", "IMG_2.HEIC"], r"holds 2 photographs in other formats \(\.heic\), .*as JPEG"),
+        ("phone", ["IMG_1.HEIC", "IMG_2.HEIC"], r"holds 2 photographs .*\(\.heic\), .*as JPEG, or pip install .*heic"),
+        ("camera", ["1.CR2", "2.CR2"], r"holds 2 photographs in other formats \(\.cr2\), .*as JPEG$"),
         ("film", ["clip.mp4"], r"give \S+clip\.mp4$"),
         ("rig", ["a.mp4", "b.MOV"], r"give \S+a\.mp4, or --rig \S+rig for films"),
         ("scene", ["images/1.png"], r"but images does; give \S+images$"),
@@ -205,7 +212,7 @@ def test_folders_without_images_say_what_they_hold(tmp_path):
             Folder(tmp_path / name)
 
 
-def test_photographs_in_other_formats_are_counted(tmp_path):
+def test_photographs_in_other_formats_are_counted(tmp_path, without_heif):
     for name in ("1.jpg", "1.dng", "2.HEIC", "3.heic"):
         (tmp_path / name).write_bytes(b"x")
     (note,) = photographs_left_out(tmp_path)

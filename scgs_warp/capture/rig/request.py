@@ -11,7 +11,7 @@ from ...data.natural_order import natural
 from ...data.unknown import FILMS
 from ...errors import UserError
 from ..features import CameraModel
-from ..folder_content import SUFFIXES, files_in, folders_in
+from ..folder_content import files_in, folders_in, read_suffixes
 from ..limits import check_limits
 
 FEWEST_CAMERAS = 2
@@ -57,7 +57,7 @@ def videos_of(folder: Path) -> list[Path]:
     found = [path for path in folder.iterdir() if path.suffix.lower() in FILMS and path.is_file()]
     files = sorted((path for path in found if not path.name.startswith(".")), key=lambda path: natural(path.name))
     if len(files) < FEWEST_CAMERAS:
-        of_images = [inner.name for inner in folders_in(folder) if files_in(inner, SUFFIXES)]
+        of_images = [inner.name for inner in folders_in(folder) if files_in(inner, read_suffixes())]
         if len(of_images) >= FEWEST_CAMERAS:
             raise UserError(
                 f"--rig {folder}: holds folders of images ({of_images[0]} to {of_images[-1]}); make a video of each, "
