@@ -105,6 +105,8 @@ class Options(FilmOptions, Output):
     """Strength of the light from --light, multiplied by the cosine with the surface normal; 0.5 is normal."""
     unlit: bool = False
     """Show textures and colours without lighting."""
+    two_sided: bool = False
+    """Show the backs of surfaces that the file of --mesh shows from one side only."""
     seed: int = 0
     """Random seed of cameras and surface points; the same seed gives the same bytes."""
     device: Device = "auto"
@@ -114,7 +116,7 @@ class Options(FilmOptions, Output):
 
 
 OF_IMAGES = ("clip", "start", "end", "train", "val", "cameras", "turns", "elevation", "background", "light", "ambient",
-             "diffuse", "unlit")  # fmt: skip
+             "diffuse", "unlit", "two_sided")  # fmt: skip
 """Options that a film does not have."""
 
 
@@ -166,7 +168,7 @@ def _render(options: Options, device: str) -> None:
     fov = FilmingSettings.fov if o.fov is None else o.fov
     views = 1 if o.views is None else o.views
     filming = FilmingSettings(size[0], size[-1], train, o.test, o.val, o.cameras, views, fov, o.elevation, o.turns)
-    shading = Shading(o.light, o.ambient, o.diffuse, o.unlit)
+    shading = Shading(o.light, o.ambient, o.diffuse, o.unlit, o.two_sided)
     samples = 4 if o.samples is None else o.samples
     request = SynthesisRequest(
         o.mesh, o.clip, o.start, o.end, filming, shading, samples, o.background, o.seed, o.subject

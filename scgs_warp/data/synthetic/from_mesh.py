@@ -4,6 +4,7 @@ the data set."""
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -15,10 +16,11 @@ import numpy as np
 from ...errors import UserError
 from ...storage.files import read_text
 from ...storage.json_files import parse_json
+from ..dataset import spread
 from ..gltf.scene import GltfScene, read_scene
 from .contact_sheet import ContactSheet
 from .mesh import MeshSubject
-from .orbit_cameras import FilmingSettings, PlannedPicture, plan_pictures
+from .orbit_cameras import FilmingSettings, PlannedPicture, camera_of, plan_pictures
 from .renderer import SURFACE_POINTS, Background, Optics, Subject, write_folder_atomically, write_pictures, write_png
 from .shading import Shading
 from .zoo import SUBJECTS
@@ -31,6 +33,10 @@ SHEET = "contact_sheet.png"
 VERSION = 1
 """Version of the pictures and the ground truth that a request yields."""
 MAX_SIDE = 8192
+LOOKED_AT, SMALL = 24, 100
+"""Number of pictures, and their size in pixels, in which backs of surfaces are looked for."""
+MANY_BACKS = 0.01
+"""Share of the subject's pixels that backs must cover to be told."""
 
 
 @dataclass(frozen=True)
@@ -120,9 +126,10 @@ def _check_subject(request: SynthesisRequest) -> None:
     if request.subject is not None and request.subject not in SUBJECTS:
         raise UserError(f"--subject {request.subject}: give one of: {', '.join(SUBJECTS)}")
     if request.mesh is None:
-        for name in ("clip", "start", "end"):
-            if getattr(request, name) is not None:
-                raise UserError(f"--{name}: is for glTF files; give one with --mesh, or leave it out")
+        given = [name for name in ("clip", "start", "end") if getattr(request, name) is not None]
+        given += ["two-sided"] if request.shading.two_sided else []
+        if given:
+            raise UserError(f"--{given[0]}: is for glTF files; give one with --mesh, or leave it out")
 
 
 def span_of(scene: GltfScene, start: float | None, end: float | None) -> tuple[float, float]:
@@ -220,7 +227,25 @@ def plan_synthesis(folder: str | Path, request: SynthesisRequest, device: str = 
         raise UserError(f"{folder}: exists and holds something else; give another --output, or remove it")
     rng = np.random.default_rng(request.seed)
     points = subject.sample(SURFACE_POINTS, rng)
-    return SynthesisPlan(folder, request, subject, points, plan_pictures(request.filming, rng), recipe, lines, made)
+    pictures = plan_pictures(request.filming, rng)
+    lines += _backs(subject, pictures["train"], request)
+    return SynthesisPlan(folder, request, subject, points, pictures, recipe, lines, made)
+
+
+def _backs(subject: Subject, pictures: list[PlannedPicture], request: SynthesisRequest) -> list[str]:
+    """Tell if parts of a file's subject vanish from behind: no scene looks like that."""
+    if not isinstance(subject, MeshSubject) or request.shading.two_sided:
+        return []
+    fov = math.radians(request.filming.fov)
+    chosen = [pictures[index] for index in spread(len(pictures), LOOKED_AT)]
+    views = [(own.time, camera_of(own.camera_to_world, fov, SMALL, SMALL)) for own in chosen]
+    share = subject.share_of_backs(views)
+    if share < MANY_BACKS:
+        return []
+    return [
+        f"{100 * share:.0f} % of the subject are backs of surfaces that the file shows from one side only: they vanish "
+        "from behind, which training cannot learn; --two-sided shows them"
+    ]
 
 
 def synthesize(planned: SynthesisPlan, progress: Callable[[int, int], None] | None = None) -> Path:
@@ -261,9 +286,12 @@ def synthesize(planned: SynthesisPlan, progress: Callable[[int, int], None] | No
 
 def _recipe(request: SynthesisRequest, identity: dict[str, Any]) -> dict[str, Any]:
     """Make the content of the marker file, which holds no path, date or host."""
+    look = asdict(request.shading)
+    if not look["two_sided"]:  # earlier versions did not have it
+        del look["two_sided"]
     options = {
         "filming": asdict(request.filming),
-        "look": asdict(request.shading),
+        "look": look,
         "samples": request.samples,
         "background": request.background,
         "seed": request.seed,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -93,7 +94,8 @@ class MeshSubject:
 
     def _upload_materials(self) -> None:
         materials, textures = self.scene.materials, self.scene.textures
-        kinds = [(m.texture, m.alpha_mode, int(m.double_sided), int(m.unlit or self.shading.unlit)) for m in materials]
+        backs, unlit = self.shading.two_sided, self.shading.unlit
+        kinds = [(m.texture, m.alpha_mode, int(m.double_sided or backs), int(m.unlit or unlit)) for m in materials]
         self.factors = self._tensor([m.factor for m in materials])
         self.cutoffs = self._tensor([m.cutoff for m in materials])
         self.kinds = torch.tensor(kinds, dtype=torch.int32, device=self.device)
@@ -130,6 +132,18 @@ class MeshSubject:
             top, columns, samples, RAY_OFFSET * ROOM_RADIUS, MAX_RAY_LENGTH, image, grain=64,
         )  # fmt: skip
         return image
+
+    def share_of_backs(self, views: Sequence[tuple[float, Camera]]) -> float:
+        """Return the share of the subject's pixels, over some times and cameras, that only the backs of surfaces cover
+        which the file shows from one side."""
+        shown, kinds, covered = self.kinds, self.kinds.clone(), [0.0, 0.0]
+        kinds[:, 2] = 1
+        for time, camera in views:
+            posed = self.pose(time)
+            for index, self.kinds in enumerate((shown, kinds)):
+                covered[index] += float(self.render(posed, camera, 1)[..., 3].sum())
+        self.kinds = shown
+        return max(0.0, 1.0 - covered[0] / covered[1]) if covered[1] > 0 else 0.0
 
     def visible(self, posed: PosedMesh, camera: Camera, points: Tensor) -> Tensor:
         """Return [P] bool, True for surface points [P, 3] that the camera sees."""

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Shading:
-    """Settings of light and diffuse shading."""
+    """Settings of light, diffuse shading and the backs of surfaces."""
 
     light: tuple[float, float, float] = (-0.42, -0.62, 0.66)
     """Direction to the light, world (z up, the subject faces -y)."""
@@ -20,3 +20,5 @@ class Shading:
     """
     unlit: bool = False
     """Show base colours without shading."""
+    two_sided: bool = False
+    """Show the backs of all surfaces, also of those that a glTF file shows from one side only."""
