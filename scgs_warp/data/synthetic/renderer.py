@@ -211,11 +211,14 @@ def subject_height(subject: Subject) -> float:
 
 def write_folder_atomically(folder: Path, write: Callable[[Path], None]) -> None:
     """Let ``write`` fill a temporary folder next to ``folder``, then rename it, so that an incomplete folder never
-    remains.
+    remains. A link stays one: the folder that it leads to is written.
 
     Raises:
-        UserError: the folder cannot be written.
+        UserError: the folder cannot be written, or is the current one or contains it.
     """
+    folder = Path(os.path.realpath(folder))
+    if Path.cwd().is_relative_to(folder):
+        raise UserError(f"{folder}: is the current folder or contains it; name a new folder")
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
         work = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
