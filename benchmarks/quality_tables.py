@@ -106,8 +106,8 @@ def training_time(run: Run) -> str:
 
 
 def cost(run: Run) -> str:
-    """Write time, make of the processor, and number of Gaussians."""
-    return f"{training_time(run)}, {thousands(run['gaussians'])}" if run else ""
+    """Write time and make of the processor, if the machine was quiet, and the number of Gaussians."""
+    return ", ".join(filter(None, [training_time(run), thousands(run["gaussians"])])) if run else ""
 
 
 def beside(columns: tuple[Column, ...], rows: tuple[tuple[str, str], ...]) -> Callable[[Source], str]:
@@ -145,7 +145,7 @@ def beside(columns: tuple[Column, ...], rows: tuple[tuple[str, str], ...]) -> Ca
 OWN_ROWS = (
     ("cpu", "**`cpu`** (24,000 steps, two CPU cores)"),
     ("hexplane", "`hexplane` (4D-GS's model, `cpu` with 12,000 steps, one CPU core)"),
-    ("best-40000", "**`best`** (40,000 steps, one CPU core)"),
+    ("best-40000", "**`best`** (40,000 steps, two CPU cores)"),
     ("best-40000-seed-1", "`best` with `--seed 1`"),
     ("best-h200", "`best` on a GPU (three of the scenes beside six other runs)"),
     ("best-today", "`best` as it was with 80,000 steps (one CPU core)"),
