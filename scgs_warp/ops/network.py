@@ -183,8 +183,9 @@ class Layers:
         inputs.view(-1)[positions.columns : self.inputs] = when[0]
         rows, width = positions.sums.shape[1:]
         hidden, out = torch.empty(2, rows, width), torch.empty(len(positions.order), self.outputs)
-        read = NETWORK_BLOCK, 0, positions.columns, self.table, self.packed, self.finite, inputs, *positions[1:]
-        launch(kernels.network_values, -(-rows // NETWORK_BLOCK), *read, hidden, out, grain=1)
+        read = NETWORK_BLOCK, 0, positions.columns, self.table, self.packed, self.finite, inputs
+        shared = positions.sums, positions.order
+        launch(kernels.network_values, -(-rows // NETWORK_BLOCK), *read, *shared, hidden, out, grain=1)
         return out
 
     def _values_in_parts(self, inputs: Tensor, hidden: Tensor, out: Tensor) -> None:

@@ -79,9 +79,8 @@ def test_a_weight_that_is_not_finite_reaches_every_row(layer, bad):
     weights, biases = biased(SHAPE, SPARSE)
     where, when = rows(SHAPE, 40, 1, 31)
     with torch.no_grad():
-        unit = weights[layer].shape[1] - 1
-        weights[layer - 1][unit if layer != 2 else -1] = 0.0
-        biases[layer - 1][-1] = -1.0  # the last unit is zero everywhere
+        weights[layer - 1][-1] = 0.0
+        biases[layer - 1][-1] = -1.0  # the last unit of the layer before is zero everywhere
         weights[layer][0, -1] = bad
         before = network(where, when, weights, biases)
         hidden = Layers(weights, biases, 76, adjoint=True).values(where, when, keep=True)[1]
@@ -92,23 +91,20 @@ def test_a_weight_that_is_not_finite_reaches_every_row(layer, bad):
 
 
 @pytest.mark.parametrize("bfloat16", [False, True])
-def test_a_gradient_that_meets_a_weight_that_is_not_finite_is_nan_in_every_row(bfloat16):
-    weights, biases = biased(SHAPE, SPARSE)
+def test_a_gradient_of_zero_that_meets_a_weight_that_is_not_finite_is_nan(bfloat16):
+    weights, biases = ([p.detach() for p in group] for group in biased(SHAPE, SPARSE))
     where, when = rows(SHAPE, 40, 1, 31)
-    with torch.no_grad():
-        for own in weights[1:]:
-            own.abs_()  # no later unit is always zero
-        weights[3][0] = 0.0
-        biases[3][0] = -1.0  # unit 0 of the last hidden layer passes no gradient
-    layers = Layers([w.detach() for w in weights], [b.detach() for b in biases], 76, adjoint=True, bfloat16=bfloat16)
-    inputs, hidden, out = layers.values(where, when, keep=True)
-    assert not bool(hidden[3].view(-1, 40, 32)[0, :, 0].any())
-    spoilt = [w.detach().clone() for w in weights]
-    spoilt[3][0, 5] = float("nan")
-    layers = Layers(spoilt, [b.detach() for b in biases], 76, adjoint=True, bfloat16=bfloat16)
-    _, gradients = layers.gradients(inputs, hidden, torch.ones_like(out), None)
-    active = bool((hidden[2].view(-1, 40, 32)[0, :, 5] > 0).any())
-    assert active and bool(gradients[2][5].isnan().any())
+    biases[2][5] = 10.0  # unit 5 of the layer before the last hidden one is above zero everywhere
+    weights[3][:32] = 0.0
+    biases[3][:32] = -1.0  # a panel of the last hidden layer is zero everywhere, and so is its gradient
+    inputs, hidden, out = Layers(weights, biases, 76, adjoint=True).values(where, when, keep=True)
+    panels = hidden.view(len(hidden), -1, hidden.shape[1], 32)
+    assert bool((panels[2, 0, :40, 5] > 0).all()) and not bool(panels[3, 0].any())
+    for bad in (0.0, float("nan")):
+        weights[3][0, 5] = bad
+        layers = Layers(weights, biases, 76, adjoint=True, bfloat16=bfloat16)
+        _, gradients = layers.gradients(inputs, hidden, torch.ones_like(out), None)
+        assert bool(gradients[2][5].isnan().all()) == (bad != bad)
 
 
 def test_the_twin_agrees_where_most_hidden_values_are_zero():

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from ...errors import UserError
+from ...storage.output_folders import make_parent
 
 ZIPPED = (".zip", ".r3d")
 PACKED = (".tar", ".gz", ".tgz", ".bz2", ".xz", ".7z", ".rar", ".zst")
@@ -41,18 +42,15 @@ def unpacked(path: Path, folder: Path, show: ShowProgress) -> Iterator[Path]:
     if not (path.is_file() and suffix in ZIPPED):
         yield path
         return
-    try:
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        work = Path(tempfile.mkdtemp(prefix=f".{folder.name}-unpacked-", dir=folder.parent))
-    except OSError as error:
-        raise UserError(f"{folder}: cannot be made ({error.strerror}); choose a folder that can be written") from None
-    try:
-        _unpack(path, work, show)
-        yield _only_folder(work)
-    except UserError as error:  # names files by their places in the archive
-        raise UserError(str(error).replace(str(work), str(path))) from None
-    finally:
-        shutil.rmtree(work, ignore_errors=True)
+    make_parent(folder)
+    prefix = f".{folder.name}-unpacked-"
+    with tempfile.TemporaryDirectory(prefix=prefix, dir=folder.parent, ignore_cleanup_errors=True) as name:
+        work = Path(name)
+        try:
+            _unpack(path, work, show)
+            yield _only_folder(work)
+        except UserError as error:  # names files by their places in the archive
+            raise UserError(str(error).replace(str(work), str(path))) from None
 
 
 def _unpack(path: Path, work: Path, show: ShowProgress) -> None:

@@ -136,13 +136,19 @@ class MeshSubject:
     def share_of_backs(self, views: Sequence[tuple[float, Camera]]) -> float:
         """Return the share of the subject's pixels, over some times and cameras, that only the backs of surfaces cover
         which the file shows from one side."""
-        shown, kinds, covered = self.kinds, self.kinds.clone(), [0.0, 0.0]
-        kinds[:, 2] = 1
-        for time, camera in views:
-            posed = self.pose(time)
-            for index, self.kinds in enumerate((shown, kinds)):
-                covered[index] += float(self.render(posed, camera, 1)[..., 3].sum())
-        self.kinds = shown
+        shown, all_shown = self.kinds, self.kinds.clone()
+        all_shown[:, 2] = 1
+        if torch.equal(shown, all_shown):
+            return 0.0
+        covered = [0.0, 0.0]
+        try:
+            for time, camera in views:
+                posed = self.pose(time)
+                for index, kinds in enumerate((shown, all_shown)):
+                    self.kinds = kinds
+                    covered[index] += float(self.render(posed, camera, 1)[..., 3].sum())
+        finally:
+            self.kinds = shown
         return max(0.0, 1.0 - covered[0] / covered[1]) if covered[1] > 0 else 0.0
 
     def visible(self, posed: PosedMesh, camera: Camera, points: Tensor) -> Tensor:
