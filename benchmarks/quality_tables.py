@@ -359,6 +359,7 @@ WRITERS: dict[str, Callable[[Source], str]] = {
     "background": backgrounds,
     "levers": levers,
     "levers-today": differences,
+    "low-rank": differences,
     "exposure": exposure,
     "films": films,
     "rig": rig,
