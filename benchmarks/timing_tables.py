@@ -175,6 +175,7 @@ def speed_overview(results: Path) -> str:
         ("rasterising, forward", "raster-cpu", "raster/forward"),
         ("rasterising, forward and all gradients", "raster-cpu", "raster/both"),
         ("a training step, 40,000 Gaussians, 400 x 400", "step-cpu", "step"),
+        ("a training step, 500,000 Gaussians, 1920 x 1080", "step-500k-cpu", "step"),
         ("editing, from a drag to the pose that a page draws", "edit-cpu", "edit/drag"),
         ("a dynamic frame of 1,000,000 Gaussians at 1920 x 1080", "million-cpu", "frame"),
     ):
@@ -237,6 +238,7 @@ BENCHMARKS = {
     "playback-cpu": Benchmark(stages, "apps/bench.py frame --playback --motion control-points,static"),
     "raster-cpu": Benchmark(stages, "apps/bench.py raster"),
     "step-cpu": Benchmark(stages, "apps/bench.py step --gaussians 40000 --size 400", TRAINING),
+    "step-500k-cpu": Benchmark(stages, "apps/bench.py step --gaussians 500000 --size 1920x1080", TRAINING),
     "edit-cpu": Benchmark(stages, "apps/bench.py edit", EDITING),
     "pull-cpu": Benchmark(stages, "apps/bench.py pull", EDITING),
     "table-s2-cpu": Benchmark(table_s2, "apps/bench.py frame --table-s2"),

@@ -84,7 +84,7 @@ def test_every_table_from_tiny_results(report, tmp_path, monkeypatch, capsys):
     assert report.main(options) == 0 and report.main([*options, "--check"]) == 0
     text = page.read_text(encoding="utf-8")
     assert "\nold\n" not in text and text.endswith("end\n")
-    assert text.count("Not measured yet: ") == 2 and "1000000 --size 1920x1080" in text
+    assert text.count("Not measured yet: ") == 3 and "1000000 --size 1920x1080" in text
     result = json.loads((tmp_path / "frame-cpu.json").read_text(encoding="utf-8"))
     first = result["rows"][0]
     assert f"`{result['command']}`" in text and result["command"].startswith(
