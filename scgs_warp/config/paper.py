@@ -144,6 +144,7 @@ PAPER = TrainConfig(
         arap_times=8,
         arap_neighbors=8,
         arap_refresh=200,
+        arap_slack=0.0,
         flow=0.0,
         flow_until=0.8,
         flow_every=2,

@@ -73,7 +73,7 @@ def preset(name: PresetName) -> TrainConfig:
             nodes_every=2_000,
             nodes_until=9_000,
         ),
-        loss=LossConfig(log_error_from=0.5, arap_until=3_000),
+        loss=LossConfig(log_error_from=0.5, arap_until=24_000),
     )
     if name == "cpu":
         return cpu
@@ -89,9 +89,10 @@ def preset(name: PresetName) -> TrainConfig:
         start_ratio=16.0,
     )
     quick = with_steps(cpu, 7_000)
-    # Rigidity to the end, neighbours by place alone, less sharpness: least error of motion on the built-in figure.
+    # Rigidity that spares no edge, neighbours by place alone, less sharpness: least error of motion on the built-in
+    # figure.
     motion = dataclasses.replace(quick.motion, hyper_dim=0, node_weight=False, correctives=False)
-    loss = dataclasses.replace(quick.loss, arap=1e-2, arap_end=1e-2, arap_until=quick.steps)
+    loss = dataclasses.replace(quick.loss, arap_slack=0.0)
     changed = {"half_size": 3_500, "sharpness": 0.25, "pretrain": stage1, "motion": motion, "loss": loss}
     return dataclasses.replace(quick, preset="quick", **changed)
 

@@ -317,7 +317,7 @@ class ControlPoints(Motion):
 
     def refresh_graph(self, step: int, loss: LossConfig) -> None:
         if graph_is_old(self.graph, step, loss):
-            self.graph = build_graph(self.trajectories, loss, self.graph)
+            self.graph = build_graph(self.trajectories, loss, self.graph, loss.arap_slack)
 
     def trajectories(self, times: Tensor) -> Tensor:
         """Return the control points [T, M, 3] at ``times`` [T]."""

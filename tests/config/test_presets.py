@@ -23,7 +23,7 @@ def test_best_preset_is_half_the_supplements_schedule():
     made = C.preset("best")
     assert (made.pretrain.steps, made.pretrain.densify_until, made.main_steps) == (5_000, 3_750, 35_000)
     assert (made.freeze, made.motion.nodes, made.motion.neighbors) == (1_500, 512, 4)
-    assert (made.loss.arap, made.loss.arap_end, made.loss.arap_until) == (1e-4, 1e-7, 5_000)
+    assert (made.loss.arap, made.loss.arap_end, made.loss.arap_until) == (1e-2, 1e-2, 40_000)
     assert (made.motion.hyper_dim, made.motion.node_weight) == (1, True), "docs/quality.md"
     assert (made.motion.layers, made.motion.position_frequencies, made.motion.time_frequencies) == (8, 10, 6)
     assert made.pretrain.progressive_every == 500
@@ -33,7 +33,7 @@ def test_steps_scale_every_milestone():
     made = C.with_steps(C.preset("best"), 8_000)
     assert made.steps == 8_000
     assert (made.pretrain.steps, made.pretrain.densify_until, made.freeze) == (1_000, 750, 300)
-    assert (made.densify.until, made.optim.means_until, made.loss.arap_until) == (4_000, 6_600, 1_000)
+    assert (made.densify.until, made.optim.means_until, made.loss.arap_until) == (4_000, 6_600, 8_000)
     assert made.densify.every == 100 and made.loss.arap_refresh == 200, "intervals are no milestones"
 
 

@@ -39,9 +39,6 @@ def test_best_is_the_former_paper_in_half_the_steps():
         "motion.hyper_dim": 1,
         "motion.hyper_dim_filled": 1,
         "motion.node_weight": True,
-        "loss.arap": 1e-4,
-        "loss.arap_end": 1e-7,
-        "loss.arap_until": 5_000,
         "pretrain.warm_up": 50,
     }
     assert {name: best[name] for name, value in values.items() if best[name] != value} == changed
@@ -54,6 +51,7 @@ def test_best_is_the_former_paper_in_half_the_steps():
         "motion.correctives": True,
         "optim.correctives": 8e-4,
         "motion.tints": True,
+        "loss.arap_slack": 0.5,
         "loss.log_error": 0.002,
         "loss.log_error_from": 0.58,
         "sharpness": 0.5,

@@ -268,6 +268,19 @@ def test_neighbours_for_rigidity_are_found_anew_now_and_then():
     assert not torch.equal(motion.graph.neighbors, before)
 
 
+def test_the_slack_of_the_settings_spares_edges_of_control_points():
+    motion = scenes.synthetic_scene("control-points", 60, 20, "cpu").motion
+    assert isinstance(motion, ControlPoints)
+    weights = {}
+    for slack in (0.0, 0.5):
+        motion.graph = None
+        motion.refresh_graph(0, tiny_config(60, loss={"arap_slack": slack}).loss)
+        assert motion.graph is not None
+        weights[slack] = motion.graph.weights.clone()
+    torch.testing.assert_close(weights[0.0].sum(1), torch.ones(20))
+    assert bool((weights[0.5] < weights[0.0]).all())
+
+
 def test_control_points_rest_until_the_gaussians_have_settled():
     scene = scenes.synthetic_scene("control-points", 60, 20, "cpu")
     motion, config = scene.motion, tiny_config(60, freeze=3)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
 import pytest
 import torch
 
@@ -15,8 +16,10 @@ from scgs_warp.motion.rigidity import (
     build_graph,
     momentary_graph,
     rigidity,
+    spared,
     tearing,
 )
+from scgs_warp.ops.arap import trajectory_graph
 from scgs_warp.seeding import generator
 
 
@@ -128,6 +131,84 @@ def test_the_energy_is_between_the_last_two_instants():
     bent = rest * torch.tensor([1.5, 1.0, 1.0])
     assert float(rigidity([bent, rest, rest + 0.5], graph)) < 1e-6
     assert torch.equal(rigidity([rest + 0.5, rest, bent], graph), rigidity([rest, bent], graph))
+
+
+def spared_in_float64(instants, neighbors, weights, slack):
+    """The weights of ``spared``, by numpy's SVD, edge by edge."""
+    instants, weights = instants.double().cpu().numpy(), weights.double().cpu().numpy()
+    neighbors = neighbors.cpu().numpy()
+    count, nodes = instants.shape[:2]
+    nearest = [np.linalg.norm(instant[neighbors[:, 0]] - instant, axis=1) for instant in instants]
+    unit = np.sort(np.concatenate(nearest))[(count * nodes - 1) // 2]
+    pairs = [(first, (first + apart) % count) for apart in (1, 2, 4) for first in range(count)]
+    share = np.ones_like(weights)
+    for _ in range(2):
+        total = np.zeros_like(weights)
+        for first, second in pairs:
+            for node in range(nodes):
+                edges = instants[first, neighbors[node]] - instants[first, node]
+                posed = instants[second, neighbors[node]] - instants[second, node]
+                left, _, right = np.linalg.svd((posed.T * (weights * share)[node]) @ edges)
+                turn = left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right
+                total[node] += ((posed - edges @ turn.T) ** 2).sum(1)
+        share = (1 + total / len(pairs) / (slack * unit) ** 2) ** -2
+    return weights * share
+
+
+def bent_bar(angles, device):
+    """A bar of 2 x 2 x 10 points, whose upper half turns by ``angles`` about an axis across its middle."""
+    grid = torch.meshgrid(torch.arange(2.0), torch.arange(2.0), torch.arange(10.0), indexing="ij")
+    bar = torch.stack(grid, -1).reshape(-1, 3) + 0.05 * torch.rand(40, 3, generator=generator(0, 1))
+    upper, joint, bent = bar[:, 2] > 4.7, torch.tensor([0.5, 0.5, 4.5]), []
+    for angle in angles:
+        turn = torch.tensor([[1, 0, 0], [0, math.cos(angle), -math.sin(angle)], [0, math.sin(angle), math.cos(angle)]])
+        bent.append(torch.where(upper[:, None], (bar - joint) @ turn.T + joint, bar))
+    return torch.stack(bent).to(device), upper.to(device)
+
+
+def test_edges_across_a_joint_count_less_than_those_of_a_limb(device):
+    instants, upper = bent_bar([0.2 * step for step in range(8)], device)
+    neighbors, weights = trajectory_graph(instants, 6)
+    found = spared(instants, neighbors, weights, 0.5)
+    expected = spared_in_float64(instants, neighbors, weights, 0.5)
+    np.testing.assert_allclose(found.cpu().numpy(), expected, rtol=1e-4, atol=1e-7)
+    across = upper[neighbors.long()] != upper[:, None]
+    assert bool(across.any()) and float((found / weights)[across].mean()) < 0.75
+    assert float((found / weights)[~across].median()) > 0.95
+
+
+def test_a_rigid_motion_spares_no_edge(device):
+    points = torch.rand(40, 3, generator=generator(0, 1))
+    instants = torch.stack([swung(points, 0.7 * time, 0.3 * time) for time in range(8)]).to(device)
+    neighbors, weights = trajectory_graph(instants, 6)
+    torch.testing.assert_close(spared(instants, neighbors, weights, 0.5), weights, rtol=1e-5, atol=0.0)
+
+
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_few_instants_spare_what_bends_between_them(count, device):
+    instants, _ = bent_bar([0.0, 1.5, 1.5][:count], device)
+    neighbors, weights = trajectory_graph(instants, 6)
+    least = float((spared(instants, neighbors, weights, 0.5) / weights).min())
+    assert least == pytest.approx(1.0) if count == 1 else least < 0.5
+
+
+def test_edges_of_points_that_are_not_finite_are_left_out(device):
+    instants, _ = bent_bar([0.1 * step for step in range(8)], device)
+    neighbors, weights = trajectory_graph(instants, 6)
+    instants[3, 7] = math.nan
+    found = spared(instants, neighbors, weights, 0.5)
+    assert bool(found.isfinite().all()) and float(found[7].sum()) == 0.0
+    assert float(found[neighbors == 7].abs().sum()) == 0.0 and float(found[30].sum()) > 0.5
+
+
+def test_a_graph_spares_edges_only_if_asked(device):
+    instants, _ = bent_bar([0.2 * step for step in range(8)], device)
+    loss = LossConfig(arap_neighbors=6)
+    full, less = (build_graph(lambda times: instants, loss, slack=slack) for slack in (0.0, 0.5))
+    assert full is not None and less is not None and torch.equal(full.neighbors, less.neighbors)
+    torch.testing.assert_close(full.weights.sum(1), torch.ones(40, device=device))
+    assert torch.equal(less.weights, spared(instants, less.neighbors, full.weights, 0.5))
+    assert build_graph(lambda times: instants, loss, full, 0.5) is full and torch.equal(full.weights, less.weights)
 
 
 def swung(points: torch.Tensor, angle: float, shift: float) -> torch.Tensor:
