@@ -360,6 +360,8 @@ WRITERS: dict[str, Callable[[Source], str]] = {
     "levers": levers,
     "levers-today": differences,
     "low-rank": differences,
+    "spared": differences,
+    "spared-short": differences,
     "exposure": exposure,
     "films": films,
     "rig": rig,
