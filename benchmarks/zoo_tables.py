@@ -61,7 +61,8 @@ def backgrounds(source: Source) -> str:
 
 
 ALTERNATIVES = {
-    "arap": "ARAP 1e-2 to the end",
+    "fading": "ARAP that fades",
+    "arap": "ARAP that spares no edge",
     "nodes-512": "512 control points",
     "progressive": "`--progressive`",
     "time-10": "10 frequencies of the time",
