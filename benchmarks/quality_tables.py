@@ -143,7 +143,7 @@ def beside(columns: tuple[Column, ...], rows: tuple[tuple[str, str], ...]) -> Ca
 
 
 OWN_ROWS = (
-    ("cpu", "**`cpu`** (24,000 steps, two CPU cores)"),
+    ("cpu", "**`cpu`** (24,000 steps, one CPU core)"),
     ("hexplane", "`hexplane` (4D-GS's model, `cpu` with 12,000 steps, one CPU core)"),
     ("best-40000", "**`best`** (40,000 steps, two CPU cores)"),
     ("best-40000-seed-1", "`best` with `--seed 1`"),
