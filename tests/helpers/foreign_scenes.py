@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -87,13 +87,13 @@ def write_vggt(folder: Path) -> Path:
     return folder / "predictions.npz"
 
 
-def write_depth_anything(folder: Path) -> Path:
+def write_depth_anything(folder: Path, images: str = "image", depth: str = "depth") -> Path:
     made = wall()
     folder.mkdir(parents=True, exist_ok=True)
+    named: dict[str, Any] = {images: made.images, depth: made.depths.astype(np.float32)}
     np.savez_compressed(
         folder / "results.npz",
-        image=made.images,
-        depth=np.float32(made.depths),
+        **named,
         conf=1 + np.random.default_rng(1).random(made.depths.shape, np.float32),
         extrinsics=made.viewmats[:, :3].astype(np.float32),
         intrinsics=np.tile(np.float32(K), (COUNT, 1, 1)),

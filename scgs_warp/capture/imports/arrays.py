@@ -4,8 +4,9 @@ MegaSaM (``NAME_sgd_cvd_hr.npz``, ``NAME_droid.npz``): ``images [N, H, W, 3]`` b
 ``intrinsic [3, 3]``, ``cam_c2w [N, 4, 4]`` camera-to-world. VGGT (``predictions.npz`` of its demo): ``images
 [N, 3, H, W]`` in [0, 1], ``depth [N, H, W, 1]``, ``depth_conf [N, H, W]``, ``intrinsic [N, 3, 3]``, ``extrinsic
 [N, 3, 4]`` world-to-camera. Depth Anything 3 (format ``npz``): ``image [N, H, W, 3]`` bytes, ``depth``, ``conf
-[N, H, W]``, ``intrinsics [N, 3, 3]``, ``extrinsics [N, 3, 4]`` world-to-camera. Scenes of DUSt3R, which has no file of
-its own, fit if they are saved under MegaSaM's names. Cameras are OpenCV's.
+[N, H, W]``, ``intrinsics [N, 3, 3]``, ``extrinsics [N, 3, 4]`` world-to-camera; ``predictions.npz`` of its app calls
+the first two ``images`` and ``depths``. Scenes of DUSt3R, which has no file of its own, fit if they are saved under
+MegaSaM's names. Cameras are OpenCV's.
 Layouts: Li et al., MegaSaM, CVPR 2025; Wang et al., VGGT, CVPR 2025; Lin et al., Depth Anything 3, 2025.
 """
 
@@ -46,6 +47,7 @@ LAYOUTS = (
     Layout("MegaSaM", "cam_c2w", True, "images", "depths", "intrinsic", ""),
     Layout("VGGT", "extrinsic", False, "images", "depth", "intrinsic", "depth_conf"),
     Layout("Depth Anything 3", "extrinsics", False, "image", "depth", "intrinsics", "conf"),
+    Layout("Depth Anything 3", "extrinsics", False, "images", "depths", "intrinsics", "conf"),
 )
 
 
@@ -61,12 +63,14 @@ def read(path: Path) -> ImportedScene:
         UserError: an array is missing, misshapen or damaged; one line names it.
     """
     names = members(path)
-    layout = next((layout for layout in LAYOUTS if layout.poses in names), None)
-    if layout is None:
+    posed = [layout for layout in LAYOUTS if layout.poses in names]
+    if not posed:
+        known, programs = (dict.fromkeys(getattr(layout, key) for layout in LAYOUTS) for key in ("poses", "program"))
         raise UserError(
-            f"{path}: holds no poses ({', '.join(layout.poses for layout in LAYOUTS)}); give an .npz of "
-            f"{', '.join(layout.program for layout in LAYOUTS)}, or one with images, depths, intrinsic and cam_c2w"
+            f"{path}: holds no poses ({', '.join(known)}); give an .npz of {', '.join(programs)}, or one with images, "
+            "depths, intrinsic and cam_c2w"
         )
+    layout = next((layout for layout in posed if layout.images in names), posed[0])
     for name, what in ((layout.images, "images"), (layout.lens, "intrinsics")):
         if name not in names:
             raise UserError(f"{path}: holds no {what} ({name}), which {layout.program} writes; export it again")

@@ -16,6 +16,7 @@ from helpers.foreign_scenes import (
     WRITERS,
     K,
     wall,
+    write_depth_anything,
     write_megasam,
     write_monst3r,
     write_polycam,
@@ -59,6 +60,13 @@ def test_cameras_images_and_times(imported):
     np.testing.assert_allclose(found[0].camera.K.numpy(), K, atol=1e-4)
     data = load(folder)
     assert np.abs(data[0].image.numpy() * 255 - truth.images[0]).max() <= 1.0
+
+
+def test_the_app_of_depth_anything_uses_other_names(tmp_path):
+    """``predictions.npz`` of its app holds the arrays of ``results.npz``, two of them in the plural."""
+    source = write_depth_anything(tmp_path / "source", images="images", depth="depths")
+    made = import_scene(source, tmp_path / "data", silent)
+    assert (made.program, made.frames) == ("Depth Anything 3", COUNT) and made.points > 500
 
 
 def test_depth_gives_points_where_the_wall_is(imported):
