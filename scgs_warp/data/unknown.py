@@ -52,8 +52,8 @@ def not_a_folder(path: Path) -> UserError:
         )
     if suffix == ".npz":
         return UserError(
-            f"{path}: is no folder; if it holds the cameras of MegaSaM, VGGT or Depth Anything 3: scgs-warp capture "
-            f"--poses {shell_words(path)} --output {shell_words(f'data/{path.stem}')}"
+            f"{path}: is no folder; if it holds the cameras of MegaSaM, VGGT, Depth Anything 3 or Pi3: scgs-warp "
+            f"capture --poses {shell_words(path)} --output {shell_words(f'data/{path.stem}')}"
         )
     if suffix == ".json" or path.name == "poses_bounds.npy":
         return UserError(f"{path}: is a file of a data set; give its folder: --data {shell_words(path.parent)}")
@@ -112,6 +112,10 @@ def _exported_by(folder: Path) -> str | None:
             return "Record3D"
     if any(folder.glob("frame_[0-9]*.json")):
         return "3D Scanner App"
+    if (folder / "color").is_dir() and any((folder / "camera").glob("*.npz")):
+        return "CUT3R"
+    if (folder / "camera_poses.txt").is_file() and (folder / "results_output").is_dir():
+        return "DA3-Streaming"
     return "MonST3R" if (folder / "pred_traj.txt").is_file() else None
 
 

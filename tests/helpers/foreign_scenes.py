@@ -78,7 +78,7 @@ def write_vggt(folder: Path) -> Path:
     np.savez(
         folder / "predictions.npz",
         images=np.moveaxis(made.images, 3, 1).astype(np.float32) / 255,
-        depth=np.float32(made.depths)[..., None],
+        depth=made.depths.astype(np.float32)[..., None],
         depth_conf=1 + np.random.default_rng(0).random(made.depths.shape, np.float32),
         extrinsic=made.viewmats[:, :3].astype(np.float32),
         intrinsic=np.tile(np.float32(K), (COUNT, 1, 1)),
@@ -99,6 +99,60 @@ def write_depth_anything(folder: Path, images: str = "image", depth: str = "dept
         intrinsics=np.tile(np.float32(K), (COUNT, 1, 1)),
     )
     return folder / "results.npz"
+
+
+def write_pi3(folder: Path) -> Path:
+    """With points of the world in place of depth and intrinsics, and the first columns unsure."""
+    made = wall()
+    folder.mkdir(parents=True, exist_ok=True)
+    x, y = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
+    rays = np.stack([(x - K[0, 2]) / K[0, 0], (y - K[1, 2]) / K[1, 1], np.ones_like(x)], -1)
+    poses = np.linalg.inv(made.viewmats)
+    points = np.einsum("nij,nhwj->nhwi", poses[:, :3, :3], rays * made.depths[..., None]) + poses[:, None, None, :3, 3]
+    confidence = 0.5 + 0.5 * np.random.default_rng(1).random((*made.depths.shape, 1), np.float32)
+    confidence[:, :, :2] = 0.0
+    np.savez(
+        folder / "predictions.npz",
+        images=made.images.astype(np.float32) / 255,
+        points=points.astype(np.float32),
+        conf=confidence,
+        camera_poses=poses.astype(np.float32),
+    )
+    return folder / "predictions.npz"
+
+
+def write_cut3r(folder: Path) -> Path:
+    made = wall()
+    for index, viewmat in enumerate(made.viewmats):
+        name = f"{index:06d}"
+        for kind in ("camera", "depth", "conf"):
+            (folder / kind).mkdir(parents=True, exist_ok=True)
+        _save(folder / f"color/{name}.png", made.images[index])
+        np.save(folder / f"depth/{name}.npy", made.depths[index].astype(np.float32))
+        np.save(folder / f"conf/{name}.npy", 1 + made.depths[index].astype(np.float32))
+        np.savez(
+            folder / f"camera/{name}.npz",
+            pose=np.linalg.inv(viewmat).astype(np.float32),
+            intrinsics=K.astype(np.float32),
+        )
+    return folder
+
+
+def write_streaming(folder: Path) -> Path:
+    made = wall()
+    (folder / "results_output").mkdir(parents=True)
+    for index in range(COUNT):
+        np.savez_compressed(
+            folder / f"results_output/frame_{index}.npz",
+            image=made.images[index],
+            depth=made.depths[index].astype(np.float32),
+            conf=1 + made.depths[index].astype(np.float32),
+            intrinsics=K.astype(np.float32),
+        )
+    rows = np.linalg.inv(made.viewmats).reshape(COUNT, 16)
+    (folder / "camera_poses.txt").write_text("".join(" ".join(str(v) for v in row) + "\n" for row in rows))
+    np.savetxt(folder / "intrinsic.txt", np.tile(K[[0, 1, 0, 1], [0, 1, 2, 2]], (COUNT, 1)))
+    return folder
 
 
 def write_monst3r(folder: Path) -> Path:
@@ -180,7 +234,10 @@ WRITERS = {
     "MegaSaM": write_megasam,
     "VGGT": write_vggt,
     "Depth Anything 3": write_depth_anything,
+    "Pi3": write_pi3,
     "MonST3R": write_monst3r,
+    "CUT3R": write_cut3r,
+    "DA3-Streaming": write_streaming,
     "Polycam": write_polycam,
     "Record3D": write_record3d,
     "3D Scanner App": write_scanner,

@@ -22,7 +22,7 @@ from ...storage.files import read_bytes
 from ...visualization.video import write_png
 from ..similarity import Similarity, upright
 from ..source import read_rgb
-from . import agreement, arrays, monst3r, phone_apps
+from . import agreement, arrays, frame_folders, monst3r, phone_apps, pi3
 from .archives import ShowProgress, unpacked
 from .depth_writing import DepthWriter, checked_depth, known_depth
 from .scene import MAX_NUMBER, OPENGL_TO_OPENCV, ImportedFrame, ImportedScene
@@ -59,20 +59,22 @@ def read_scene(path: Path) -> ImportedScene:
     """
     if not path.exists():
         raise UserError(f"--poses {path}: no such file or folder; give what the other program exported")
+    if pi3.recognises(path):
+        return pi3.read(path)
     if arrays.recognises(path):
         return arrays.read(path)
     if path.is_dir():
         if monst3r.recognises(path):
             return monst3r.read(path)
-        for recognises, read in phone_apps.LAYOUTS:
+        for recognises, read in (*frame_folders.LAYOUTS, *phone_apps.LAYOUTS):
             if recognises(path):
                 return read(path)
         if (path / FILE).is_file():
             raise UserError(f"--poses {path}: is in nerfstudio's layout already; python apps/train.py --data {path}")
     raise UserError(
-        f"--poses {path}: is no scene of MegaSaM, VGGT or Depth Anything 3 (.npz), MonST3R ({monst3r.TRAJECTORY}), "
-        "Polycam (keyframes), Record3D (.r3d; metadata.json, rgb) or 3D Scanner App (frame_00000.json); export one of "
-        "these"
+        f"--poses {path}: is no scene of MegaSaM, VGGT, Depth Anything 3 or Pi3 (.npz), MonST3R "
+        f"({monst3r.TRAJECTORY}), CUT3R (camera, color), DA3-Streaming ({frame_folders.POSES}), Polycam (keyframes), "
+        "Record3D (.r3d; metadata.json, rgb) or 3D Scanner App (frame_00000.json); export one of these"
     )
 
 

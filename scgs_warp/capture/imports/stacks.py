@@ -16,6 +16,10 @@ from ...storage.safe_paths import is_regular
 
 MAX_FRAME_BYTES = 1 << 28
 MAX_FRAMES = 20_000
+SMALLEST = 8
+"""Smallest side of an image, pixels."""
+OVERSHOOT = 0.1
+"""How far colours may leave [0, 1], as resampling makes them."""
 
 
 class Stack:
@@ -78,6 +82,26 @@ class Stack:
             raise UserError(f"{self.path}: no sound .npz ({type(error).__name__}); export it again") from None
 
 
+class InOrder:
+    """Frames of a stack by their index; asked for in ascending order, each is read once."""
+
+    def __init__(self, stack: Stack) -> None:
+        self._stack = stack
+        self._next = 0
+        self._frames: Iterator[np.ndarray] | None = None
+        self._last: np.ndarray | None = None
+
+    def at(self, index: int) -> np.ndarray:
+        """Return a frame."""
+        if self._frames is None or index < self._next - 1:
+            self._frames, self._next, self._last = self._stack.frames(), 0, None
+        while self._next <= index:
+            self._last = next(self._frames)
+            self._next += 1
+        assert self._last is not None
+        return self._last
+
+
 def members(path: Path) -> set[str]:
     """Return the names of the arrays in an ``.npz``; empty if the file is none."""
     try:
@@ -85,3 +109,48 @@ def members(path: Path) -> set[str]:
             return {name[:-4] for name in archive.namelist() if name.endswith(".npy")}
     except Exception:  # whatever is wrong with the file, it holds no arrays
         return set()
+
+
+def open_maps(path: Path, name: str, shape: tuple[int, int, int]) -> Stack:
+    """Open an array [N, H, W], perhaps with a further axis of length 1."""
+    stack = Stack(path, name)
+    if tuple(side for side in stack.shape[1:] if side != 1) != shape[1:] or stack.shape[0] != shape[0]:
+        raise UserError(
+            f"{path}: {name} is {list(stack.shape)}, which does not fit {shape[0]} images of {shape[2]} x {shape[1]} "
+            "pixels; export it again"
+        )
+    return stack
+
+
+def image_size(images: Stack) -> tuple[int, int, bool]:
+    """Return height, width, and whether the channels come first."""
+    path, name, shape = images.path, images.member, images.shape
+    if len(shape) == 4 and shape[3] == 3:
+        height, width, first = shape[1], shape[2], False
+    elif len(shape) == 4 and shape[1] == 3:
+        height, width, first = shape[2], shape[3], True
+    else:
+        raise UserError(f"{path}: {name} is {list(shape)}, not [N, H, W, 3] or [N, 3, H, W]; export it again")
+    if images.kind.kind != "f" and images.kind != np.uint8:
+        raise UserError(f"{path}: {name} holds {images.kind}, not bytes or numbers in [0, 1]; export it again")
+    if min(height, width) < SMALLEST:
+        raise UserError(f"{path}: {name} are {width} x {height} pixels; export larger ones")
+    return height, width, first
+
+
+def picture(values: np.ndarray, channels_first: bool, place: str) -> np.ndarray:
+    """Return a picture [H, W, 3] uint8 of bytes, or of numbers in [0, 1]; ``place`` names it in an error."""
+    image = np.moveaxis(values, 0, 2) if channels_first else values
+    if image.dtype == np.uint8:
+        return np.ascontiguousarray(image)
+    finite = np.nan_to_num(floats(image), nan=0.0, posinf=1.0, neginf=0.0)
+    least, most = float(finite.min()), float(finite.max())
+    if least < -OVERSHOOT or most > 1.0 + OVERSHOOT:
+        raise UserError(f"{place} goes from {least:g} to {most:g}; export bytes, or numbers in [0, 1]")
+    return np.ascontiguousarray(np.rint(finite.clip(0.0, 1.0) * 255.0).astype(np.uint8))
+
+
+def floats(values: np.ndarray) -> np.ndarray:
+    """Convert to float64."""
+    with np.errstate(invalid="ignore"):  # signalling NaN would warn
+        return values.astype(np.float64)
