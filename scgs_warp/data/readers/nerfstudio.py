@@ -1,7 +1,8 @@
 """Reader of the nerfstudio layout: one ``transforms.json`` for all frames, with intrinsics, poses and optional points.
 
 ``fl_x, fl_y, cx, cy, w, h`` (pixels; for all frames or in each), per frame ``file_path``, ``transform_matrix``
-(camera-to-world, OpenGL), ``time`` in [0, 1], ``mask_path`` and ``depth_file_path`` (``depth_maps``);
+(camera-to-world, OpenGL), ``time`` in [0, 1] or else ``timestamp``, ``mask_path`` and ``depth_file_path``
+(``depth_maps``), which instant-ngp calls ``depth_path``, with ``integer_depth_scale`` as its unit;
 ``ply_file_path``, sparse points in the frame of the poses; ``train_filenames``, ``val_filenames``,
 ``test_filenames``; ``camera_model`` and ``k1`` ... ``k6, p1, p2``, or ``distortion_params``, for all frames or in each
 (images with distortion are undistorted). Layout: Tancik et al., Nerfstudio, SIGGRAPH 2023.
@@ -51,10 +52,11 @@ def recognises(folder: Path) -> bool:
 def read(folder: Path, split: str, options: ReadOptions) -> Dataset:
     """Read one split.
 
-    Frames without times are evenly spaced in the order of their names (9 before 10). Without lists of files, every
-    eighth frame is held out for ``test`` and ``val`` alike. If only one of the lists for ``test`` and ``val`` is
-    present and not empty, it serves for both splits. A frame's mask is False where ``mask_path`` is black and on the
-    borders of undistorted images. The camera of a frame is the folder of its image.
+    Frames without times have those of ``timestamp``, if they are of one camera, or are evenly spaced in the order of
+    their names (9 before 10). Without lists of files, every eighth frame is held out for ``test`` and ``val`` alike. If
+    only one of the lists for ``test`` and ``val`` is present and not empty, it serves for both splits. A frame's mask
+    is False where ``mask_path`` is black and on the borders of undistorted images. The camera of a frame is the folder
+    of its image.
 
     Raises:
         UserError: the data is invalid; one line names the file, the field and the remedy.
@@ -80,7 +82,8 @@ def read(folder: Path, split: str, options: ReadOptions) -> Dataset:
     first = choice.indices[0]
     smaller = note_reduced(path, {**content, **entries[first]}, files[first])
     notes = [*located.notes, *scaled, *choice.notes, *smaller, *([] if offset is None else [note(offset)])]
-    notes += _of_depth(path, content) + _without_depth(path, [entries[index] for index in chosen], records)
+    named = sum(bool(entries[index].get(_depth_keys(content, entries[index])[0])) for index in chosen)
+    notes += _of_depth(path, content) + _without_depth(path, named, records)
     data = assemble(records, options, folder=folder, split=split, one_size=True, border=border, notes=notes)
     return with_points(data, *_points(path, folder, content, data.cameras, np.zeros(3) if offset is None else offset))
 
@@ -104,16 +107,27 @@ def _record(
 
 def _depth(path: Path, folder: Path, content: dict[str, Any], index: int) -> DepthFile | None:
     """Return the depth map that a frame names; None without a name, or without such a file."""
-    name = content["frames"][index].get("depth_file_path")
+    entry = content["frames"][index]
+    key, unit_key = _depth_keys(content, entry)
+    name = entry.get(key)
     if name is None or name == "":
         return None
     if not isinstance(name, str):
-        raise UserError(f"{path}: frames[{index}].depth_file_path is not text; name the depth map or leave it out")
-    unit = as_number(content.get("depth_unit_scale_factor", MILLIMETRE))
+        raise UserError(f"{path}: frames[{index}].{key} is not text; name the depth map or leave it out")
+    unit = as_number(content.get(unit_key, MILLIMETRE))
     if unit is None or unit <= 0.0:
-        raise UserError(f"{path}: depth_unit_scale_factor is no positive number; give the unit of the depth maps")
-    file = inside(folder, name, f"{path}: frames[{index}].depth_file_path", "depth map")
+        raise UserError(f"{path}: {unit_key} is no positive number; give the unit of the depth maps")
+    file = inside(folder, name, f"{path}: frames[{index}].{key}", "depth map")
     return DepthFile(file, unit) if file.exists() else None
+
+
+def _depth_keys(content: dict[str, Any], entry: dict[str, Any]) -> tuple[str, str]:
+    """Return the field that names a frame's depth map, and the one that holds its unit: those of instant-ngp, which
+    reads maps only if it has a unit, if the frame has none of nerfstudio's."""
+    wanted = "integer_depth_scale" in content and content.get("enable_depth_loading") is not False
+    if wanted and "depth_path" in entry and "depth_file_path" not in entry:
+        return "depth_path", "integer_depth_scale"
+    return "depth_file_path", "depth_unit_scale_factor"
 
 
 def _of_depth(path: Path, content: dict[str, Any]) -> list[str]:
@@ -125,22 +139,20 @@ def _of_depth(path: Path, content: dict[str, Any]) -> list[str]:
     return [f"{path} has no depth_unit_scale_factor: depth maps are read as millimetres; give 1 if they are in metres"]
 
 
-def _without_depth(path: Path, chosen: list[dict[str, Any]], records: list[FrameRecord]) -> list[str]:
-    """Return a note if frames of a split name depth maps that are missing.
-
-    Args:
-        chosen: entries of the frames of ``records``.
-    """
-    named = [entry for entry in chosen if entry.get("depth_file_path")]
-    missing = len(named) - sum(record.depth is not None for record in records)
+def _without_depth(path: Path, named: int, records: list[FrameRecord]) -> list[str]:
+    """Return a note if some of the ``named`` depth maps of a split's frames are missing."""
+    missing = named - sum(record.depth is not None for record in records)
     if missing == 0:
         return []
-    return [f"{path}: {missing} of {len(named)} depth maps are missing; their frames count as frames without one"]
+    return [f"{path}: {missing} of {named} depth maps are missing; their frames count as frames without one"]
 
 
 def _times(path: Path, entries: list[dict[str, Any]], files: list[Path]) -> Times:
     if any(entry.get("time") is not None for entry in entries):
         return read_times(path, entries)
+    stamps = [as_number(entry.get("timestamp")) for entry in entries]
+    if None not in stamps and len(set(stamps)) > 1 and len({file.parent for file in files}) == 1:
+        return read_times(path, [{"time": stamp} for stamp in stamps])
     moments = _moments(files)
     last = max(len(set(moments)) - 1, 1)
     return Times([moment / last for moment in moments], ())

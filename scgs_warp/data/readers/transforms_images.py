@@ -59,7 +59,7 @@ def _moved(path: Path, folder: Path, entries: list[dict[str, Any]]) -> FrameFile
 def _with_moved_maps(entry: dict[str, Any], move: Move) -> dict[str, Any]:
     """Drop from the names of a frame's mask and depth map the folders that its image's name has lost."""
     lost, moved = parts_of(entry["file_path"])[: move.dropped], dict(entry)
-    for key in ("mask_path", "depth_file_path"):
+    for key in ("mask_path", "depth_file_path", "depth_path"):
         if isinstance(entry.get(key), str) and parts_of(entry[key])[: move.dropped] == lost:
             moved[key] = "/".join(parts_of(entry[key])[move.dropped :])
     return moved
