@@ -1,6 +1,7 @@
 """Lenses: the pinhole camera inside a camera model, and undistortion of images to this pinhole camera.
 
-pycolmap evaluates the camera models of COLMAP, which include those of OpenCV and nerfstudio; OpenCV resamples pixels.
+pycolmap evaluates the camera models of COLMAP, which include those of OpenCV and most of nerfstudio; OpenCV resamples
+pixels.
 Pixel centres are at +0.5, as in COLMAP; OpenCV's own functions count from the centre of the first pixel.
 """
 
@@ -24,6 +25,9 @@ EDGE_TOLERANCE = 0.01
 """Tolerance for rounding errors beyond the outermost pixel centres, in pixels."""
 SINGLE_FOCAL = ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "SIMPLE_FISHEYE", "SIMPLE_DIVISION")
 SINGLE_FOCAL += ("SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
+BROWN4 = "BROWN4"
+"""Model that COLMAP does not have: (fx, fy, cx, cy, k1, k2, p1, p2, k3, k4), the radial part a polynomial with k4 at
+the eighth power of the radius, as nerfstudio's OPENCV, Metashape and RealityCapture have it."""
 PINHOLE_AT_ZERO = ("SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV", "SIMPLE_DIVISION", "DIVISION")
 """Models that reduce to a pinhole if all parameters beyond the first three or four are 0."""
 
@@ -37,7 +41,7 @@ class Lens:
     cx: float
     cy: float
     model: str = "PINHOLE"
-    """COLMAP's name of the camera model."""
+    """COLMAP's name of the camera model, or ``BROWN4``."""
     params: tuple[float, ...] = ()
     """Parameters of the model in COLMAP's order, including focal lengths and centre; empty for a pinhole."""
     skew: float = 0.0
@@ -55,22 +59,20 @@ class Lens:
 
 
 def make_lens(model: str, params: tuple[float, ...], skew: float = 0.0) -> Lens:
-    """Make the lens of a COLMAP model with these parameters.
+    """Make the lens of a COLMAP model, or of ``BROWN4``, with these parameters.
 
     Raises:
         ValueError: the model is unknown, the number of parameters is wrong, or their values are impossible.
     """
     pycolmap = import_pycolmap()
     known = pycolmap.CameraModelId.__members__
-    if model not in known or model == "INVALID":
+    if (model not in known and model != BROWN4) or model == "INVALID":
         raise ValueError(f"camera model {model[:40]!r} is not known")
     if model == "EQUIRECTANGULAR":
         raise ValueError("camera model EQUIRECTANGULAR sees all around, which no pinhole does")
     if not all(math.isfinite(value) and abs(value) < 1e9 for value in (*params, skew)):
         raise ValueError("camera parameters are not finite, or absurd")
-    camera = pycolmap.Camera(model=model, width=1, height=1)
-    camera.params = list(params)
-    if not camera.verify_params():
+    if not _takes(model, params):
         raise ValueError(f"camera model {model} does not take {len(params)} parameters")
     fx, fy = (params[0], params[0]) if model in SINGLE_FOCAL else params[:2]
     cx, cy = params[1:3] if model in SINGLE_FOCAL else params[2:4]
@@ -79,8 +81,20 @@ def make_lens(model: str, params: tuple[float, ...], skew: float = 0.0) -> Lens:
     return Lens(fx, fy, cx, cy, model, params, skew)
 
 
+def _takes(model: str, params: tuple[float, ...]) -> bool:
+    """Return whether a model that is known has as many parameters."""
+    if model == BROWN4:
+        return len(params) == 10
+    camera = import_pycolmap().Camera(model=model, width=1, height=1)
+    camera.params = list(params)
+    return camera.verify_params()
+
+
 def rescaled(lens: Lens, size: tuple[int, int], new: tuple[int, int]) -> Lens:
-    """Return the lens of a COLMAP model, of images of one (width, height), for the same images at a new one."""
+    """Return the lens of images of one (width, height) for the same images at a new one."""
+    if lens.model == BROWN4:
+        scales = (new[0] / size[0], new[1] / size[1])
+        return make_lens(BROWN4, (*(x * s for x, s in zip(lens.params[:4], 2 * scales)), *lens.params[4:]), lens.skew)
     camera = import_pycolmap().Camera(model=lens.model, width=size[0], height=size[1])
     camera.params = list(lens.params)
     camera.rescale(*new)
@@ -90,16 +104,29 @@ def rescaled(lens: Lens, size: tuple[int, int], new: tuple[int, int]) -> Lens:
 def project(lens: Lens, rays: np.ndarray) -> np.ndarray:
     """Project camera rays [N, 3] (x right, y down, z forward) to pixels [N, 2] of the file; NaN where the model is
     undefined."""
-    pycolmap = import_pycolmap()
     model, params = lens.model, lens.params
     if not params:
         model, params = "PINHOLE", (lens.fx, lens.fy, lens.cx, lens.cy)
-    camera = pycolmap.Camera(model=model, width=1, height=1)
-    camera.params = list(params)
     with np.errstate(all="ignore"):
-        pixels = np.asarray(camera.img_from_cam(np.ascontiguousarray(rays, np.float64)), np.float64)
+        if model == BROWN4:
+            pixels = _brown4(params, np.asarray(rays, np.float64))
+        else:
+            camera = import_pycolmap().Camera(model=model, width=1, height=1)
+            camera.params = list(params)
+            pixels = np.asarray(camera.img_from_cam(np.ascontiguousarray(rays, np.float64)), np.float64)
     pixels[:, 0] += lens.skew / lens.fy * (pixels[:, 1] - lens.cy)
     return pixels
+
+
+def _brown4(params: tuple[float, ...], rays: np.ndarray) -> np.ndarray:
+    """Project rays [N, 3] to pixels [N, 2]; NaN behind the camera."""
+    fx, fy, cx, cy, k1, k2, p1, p2, k3, k4 = params
+    x, y = np.where(rays[:, 2] > 0.0, rays[:, :2].T / rays[:, 2], np.nan)
+    square = x * x + y * y
+    radial = 1.0 + square * (k1 + square * (k2 + square * (k3 + square * k4)))
+    u = x * radial + 2.0 * p1 * x * y + p2 * (square + 2.0 * x * x)
+    v = y * radial + 2.0 * p2 * x * y + p1 * (square + 2.0 * y * y)
+    return np.stack([fx * u + cx, fy * v + cy], axis=1)
 
 
 def valid_radius(lens: Lens, width: int, height: int) -> float:

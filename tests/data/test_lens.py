@@ -10,8 +10,20 @@ import pytest
 import torch
 
 from helpers.warped import landing, picture, pixel_centres, straight
+from scgs_warp.capture.source import read_rgb
 from scgs_warp.data import load
-from scgs_warp.data.lens import Lens, make_lens, project, undistort, undistortion_maps, valid_pixels, valid_radius
+from scgs_warp.data.lens import (
+    BROWN4,
+    Lens,
+    make_lens,
+    project,
+    rescaled,
+    undistort,
+    undistortion_maps,
+    valid_pixels,
+    valid_radius,
+)
+from scgs_warp.errors import UserError
 
 WIDTH, HEIGHT = 96, 72
 K = np.array([[70.0, 0.0, 46.0], [0.0, 74.0, 37.5], [0.0, 0.0, 1.0]])
@@ -42,6 +54,43 @@ def test_rays_land_where_opencv_says(case):
         lens = make_lens("FULL_OPENCV", (*INTRINSICS, *distortion))
     np.testing.assert_allclose(project(lens, rays), expected.reshape(-1, 2), atol=1e-9)
     assert lens.distorted
+
+
+@pytest.mark.parametrize("listed", [False, True])
+def test_the_fourth_radial_parameter_of_nerfstudio(tmp_path, listed):
+    """Metashape and RealityCapture calibrate it. Without it the lens is OpenCV's; with it, rays move by k4 r^8."""
+    polynomial = {**BROWN, "k4": 0.03}
+    rays = np.random.default_rng(0).uniform((-0.5, -0.5, 1.0), (0.5, 0.5, 2.0), (200, 3))
+    rays[0, 2] = -1.0
+    expected, _ = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), K, opencv(BROWN, False))
+    plane = rays[:, :2] / rays[:, 2:]
+    further = 0.03 * (plane**2).sum(1, keepdims=True) ** 4 * plane * INTRINSICS[:2]
+    lens = make_lens(BROWN4, (*INTRINSICS, *(polynomial[key] for key in ("k1", "k2", "p1", "p2", "k3", "k4"))))
+    landed = project(lens, rays)
+    np.testing.assert_allclose(landed[1:], expected.reshape(-1, 2)[1:] + further[1:], atol=1e-9)
+    assert lens.distorted and np.isnan(landed[0]).all(), "behind the camera"
+    half = rescaled(lens, (WIDTH, HEIGHT), (WIDTH // 2, HEIGHT // 2))
+    np.testing.assert_allclose(project(half, rays[1:]), landed[1:] / 2, atol=1e-9)
+    write(tmp_path, None if listed else "OPENCV", BROWN)
+    content = json.loads((tmp_path / "transforms.json").read_text())
+    if listed:
+        named = ("k1", "k2", "k3", "k4", "p1", "p2")
+        content = {key: value for key, value in content.items() if key not in named}
+        content["distortion_params"] = [polynomial[key] for key in named]
+    else:
+        content |= polynomial
+    (tmp_path / "transforms.json").write_text(json.dumps(content))
+    frame = load(tmp_path)[0]
+    with_it, _, valid = undistortion_maps(lens, WIDTH, HEIGHT)
+    shown = read_rgb(tmp_path / "0.png").astype(np.float32) / 255.0
+    wanted = cv2.remap(shown, *undistortion_maps(lens, WIDTH, HEIGHT)[:2], cv2.INTER_LINEAR)
+    assert np.abs(frame.image.numpy() - wanted)[valid].max() < 0.01
+    plain = undistortion_maps(make_lens("FULL_OPENCV", (*INTRINSICS, *opencv(BROWN, False))), WIDTH, HEIGHT)[0]
+    assert np.abs(with_it - plain)[valid].max() > 0.01, "the parameter matters"
+    content |= {"k5": 0.1}
+    (tmp_path / "transforms.json").write_text(json.dumps(content))
+    with pytest.raises(UserError, match=r"k5 is 0\.1, a lens distortion that camera_model"):
+        load(tmp_path)
 
 
 def write(folder, model, values, mode="RGB", **changes) -> np.ndarray:

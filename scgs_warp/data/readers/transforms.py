@@ -16,7 +16,7 @@ from ...geometry.rotation import RIGID_TOLERANCE, is_rotation
 from ...storage.json_files import as_number, numbers, read_json
 from ...storage.safe_paths import inside
 from ..images import header_sizes, is_reduced, size_text
-from ..lens import Lens, make_lens, rescaled
+from ..lens import BROWN4, Lens, make_lens, rescaled
 
 OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 SUFFIXES = (".png", ".jpg", ".jpeg", ".webp")
@@ -141,7 +141,7 @@ def find_mask(path: Path, folder: Path, index: int, entry: dict[str, Any]) -> Pa
 
 
 def read_distortion(path: Path, fields: dict[str, Any]) -> tuple[str, tuple[float, ...]]:
-    """Return COLMAP's camera model, and its parameters after (fx, fy, cx, cy).
+    """Return the camera model, COLMAP's or ``BROWN4``, and its parameters after (fx, fy, cx, cy).
 
     Args:
         fields: the fields of the file, overridden by those of a frame.
@@ -171,6 +171,8 @@ def read_distortion(path: Path, fields: dict[str, Any]) -> tuple[str, tuple[floa
         return "PINHOLE", ()
     if fields.get("is_fisheye") or (name is not None and name.upper() in FISHEYES):
         kind, unused = "OPENCV_FISHEYE", ("k5", "k6", "p1", "p2")
+    elif k4 != 0.0 and (listed is not None if name is None else name.upper() == "OPENCV"):
+        kind, unused = BROWN4, ("k5", "k6")  # nerfstudio's k4 belongs to the polynomial, OpenCV's to a quotient
     else:
         kind, unused = "FULL_OPENCV", () if name is not None and name.upper() == "FULL_OPENCV" else ("k4", "k5", "k6")
     for key in unused:
@@ -179,7 +181,9 @@ def read_distortion(path: Path, fields: dict[str, Any]) -> tuple[str, tuple[floa
                 f"{path}: {key} is {values[key]:g}, a lens distortion that camera_model {name} does not have; "
                 "name the model that was calibrated, or undistort the images and set it to 0"
             )
-    return kind, (k1, k2, k3, k4) if kind == "OPENCV_FISHEYE" else (k1, k2, p1, p2, k3, k4, k5, k6)
+    if kind == "OPENCV_FISHEYE":
+        return kind, (k1, k2, k3, k4)
+    return kind, (k1, k2, p1, p2, k3, k4) if kind == BROWN4 else (k1, k2, p1, p2, k3, k4, k5, k6)
 
 
 def _parameter(path: Path, key: str, value: Any) -> float:
