@@ -8,7 +8,9 @@ Layout: Pumarola et al., D-NeRF, CVPR 2021, and NeRF's Blender scenes.
 
 from __future__ import annotations
 
+import re
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -94,8 +96,38 @@ def _path(folder: Path, split: str) -> tuple[Path, bool]:
 def _times(folder: Path, path: Path, entries: list[dict[str, Any]]) -> Times:
     """Return the times of a file's frames, on the scale of those of all splits."""
     paths = [transforms_path(folder, split) for split in ("train", "test", "val")]
-    others = [read_transforms(other)["frames"] for other in paths if other != path and other.is_file()]
-    return read_times(path, entries, [entry for frames in others for entry in frames])
+    others = {other: read_transforms(other)["frames"] for other in paths if other != path and other.is_file()}
+    elsewhere = [entry for frames in others.values() for entry in frames]
+    if _is_animation(others.get(transforms_path(folder, "train"), entries), [entries, *others.values()]):
+        return Times(_numbers_as_times(entries, [*entries, *elsewhere]), ())
+    return read_times(path, entries, elsewhere)
+
+
+def _is_animation(training: list[dict[str, Any]], files: list[list[dict[str, Any]]]) -> bool:
+    """Return whether frames without times are of one animation, whose numbers their names tell: each file lists the
+    frames of ``training``, and further ones between them or beyond by less than their largest step. Of other scenes,
+    each file numbers its own views from the first on."""
+    frames = [entry for entries in files for entry in entries]
+    numbers, trained = [_number(entry) for entry in frames], sorted({_number(entry) or 0 for entry in training})
+    if len(files) < 2 or len(trained) < 2 or None in numbers or any(entry.get("time") is not None for entry in frames):
+        return False
+    step = max(later - earlier for earlier, later in pairwise(trained))
+    within = all(trained[0] - step < (number or 0) < trained[-1] + step for number in numbers)
+    return within and all(set(trained) <= {_number(entry) for entry in entries} for entries in files)
+
+
+def _number(entry: dict[str, Any]) -> int | None:
+    """Return the number at the end of the name of a frame's image; None without one."""
+    name = entry.get("file_path")
+    match = re.search(r"([0-9]{1,9})(?:\.[A-Za-z]+)?$", name) if isinstance(name, str) else None
+    return None if match is None else int(match[1])
+
+
+def _numbers_as_times(entries: list[dict[str, Any]], every: list[dict[str, Any]]) -> list[float]:
+    """Return the numbers of frames, scaled so that those of ``every`` frame go from 0 to 1."""
+    numbers = [_number(entry) or 0 for entry in every]
+    first, last = min(numbers), max(numbers)
+    return [((_number(entry) or 0) - first) / (last - first) for entry in entries]
 
 
 def _of_trained(folder: Path, path: Path, held: list[dict[str, Any]]) -> list[str]:

@@ -11,7 +11,7 @@ import pytest
 import torch
 from PIL import Image as PillowImage
 
-from helpers.dnerf_files import HEIGHT, HUGE, WIDTH, edit, write_scene
+from helpers.dnerf_files import HEIGHT, HUGE, IDENTITY, WIDTH, edit, write_scene
 from scgs_warp.data import load
 from scgs_warp.errors import UserError
 from scgs_warp.geometry.normalisation import Normalisation
@@ -99,6 +99,44 @@ def test_times_in_other_units_are_scaled_alike_in_all_files(tmp_path, unit):
     edit(scene, lambda content: [frame.update(time=2.0) for frame in content["frames"]])
     test.unlink()
     assert load(scene).times.tolist() == [0.0, 0.0]  # one of three is held out
+
+
+def write_animation(folder: Path, train: range, test: range, name: str = "{}/{:04d}.png") -> None:
+    """What BlenderNeRF writes of an animation: pictures numbered by its frames, without times."""
+    for split, numbers in (("train", train), ("test", test)):
+        entries = []
+        for number in numbers:
+            path = folder / name.format(split, number)
+            path.parent.mkdir(parents=True, exist_ok=True)
+            PillowImage.new("RGB", (WIDTH, HEIGHT), (number, 9, 9)).save(path)
+            entries.append({"file_path": name.format(split, number), "transform_matrix": IDENTITY})
+        content = {"camera_angle_x": 0.8, "w": float(WIDTH), "h": float(HEIGHT), "frames": entries}
+        (folder / f"transforms_{split}.json").write_text(json.dumps(content))
+
+
+@pytest.mark.parametrize("step", [1, 3, 5])
+def test_pictures_of_an_animation_have_the_times_of_its_frames(tmp_path, step):
+    """The last training picture is not of the last frame if the step does not divide their number."""
+    write_animation(tmp_path, range(1, 13, step), range(1, 13))
+    for split, numbers in (("train", range(1, 13, step)), ("test", range(1, 13)), ("val", range(1, 13))):
+        expected = [(number - 1) / 11 for number in numbers]
+        assert load(tmp_path, split).times.tolist() == pytest.approx(expected, abs=1e-6)
+    assert load(tmp_path, "train", frames="::2").times.tolist()[0] == 0.0
+
+
+@pytest.mark.parametrize(
+    ("train", "test", "name"),
+    [
+        (range(10), range(20), "{}/r_{}.png"),  # NeRF's scenes have twice as many test views
+        (range(30), range(7), "{}/r_{:03d}.png"),  # D-NeRF's have fewer
+        (range(1, 4), range(1, 4), "{}/{}th.png"),
+    ],
+)
+def test_files_that_number_their_own_views_keep_the_times_of_their_order(tmp_path, train, test, name):
+    write_animation(tmp_path, train, test, name)
+    for split, numbers in (("train", train), ("test", test)):
+        times = load(tmp_path, split).times.tolist()
+        assert times == pytest.approx(np.linspace(0.0, 1.0, len(numbers)).tolist(), abs=1e-6)
 
 
 def test_held_out_frames_that_are_trained_on_are_noted(tmp_path):
