@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from ...errors import UserError
+from ...storage.json_files import read_json
 from ..assemble import FrameRecord, assemble
 from ..choice import Choice, choose, choose_instants, of_cameras, present
 from ..dataset import Dataset
@@ -47,7 +48,7 @@ def recognises(folder: Path) -> bool:
 
 def read(folder: Path, split: str, options: ReadOptions) -> Dataset:
     """Read one split. If the files of ``test`` and ``val`` are both missing, every eighth frame of ``train`` is held
-    out; if one of them is missing, the other one serves for both.
+    out; if one of them is missing, the other one serves for both. A file of which no image exists counts as missing.
 
     Raises:
         UserError: the data is invalid; one line names the file, the field and the remedy.
@@ -69,7 +70,7 @@ def read(folder: Path, split: str, options: ReadOptions) -> Dataset:
         choice = _within_training(folder, path, files, times, options)
     chosen = held_out(path, choice.indices, split) if shared else choice.indices
     smaller = note_reduced(path, {**content, **entries[chosen[0]]}, files[chosen[0]])
-    notes = [*located.notes, *scaled, *choice.notes, *smaller]
+    notes = [*located.notes, *scaled, *choice.notes, *smaller, *_unused(folder)]
     if not shared and split != "train":
         notes += _of_trained(folder, path, [entries[index] for index in chosen])
     records = []
@@ -87,16 +88,40 @@ def read(folder: Path, split: str, options: ReadOptions) -> Dataset:
 def _path(folder: Path, split: str) -> tuple[Path, bool]:
     """Return the file of the split, and whether the file is shared by all splits. A missing file for ``test`` or
     ``val`` is replaced by the other one or, without either, by the file for ``train``, which is then shared."""
-    there = [name for name in ("test", "val") if transforms_path(folder, name).is_file()]
+    there = [name for name in ("test", "val") if _is_used(folder, name)]
     if not there and transforms_path(folder, "train").is_file():
         return transforms_path(folder, "train"), True
     return transforms_path(folder, split if split in ("train", *there) else (there or [split])[0]), False
 
 
+def _is_used(folder: Path, split: str) -> bool:
+    """Return whether the file of a split is there and, beside one for ``train``, lists a frame whose image exists.
+    Files of camera paths list none, or some that were never rendered. What is no list of frames counts: it is refused
+    later."""
+    path = transforms_path(folder, split)
+    if not path.is_file() or split == "train" or not transforms_path(folder, "train").is_file():
+        return path.is_file()
+    try:
+        content = read_json(path)
+        if isinstance(content, dict) and content.get("frames") == []:
+            return False
+        files = find_images(path, folder, read_transforms(path)["frames"]).files
+    except UserError:
+        return True
+    return any(file.is_file() for file in files)
+
+
+def _unused(folder: Path) -> list[str]:
+    """Return notes on files of which no image exists."""
+    paths = {split: transforms_path(folder, split) for split in ("test", "val")}
+    unused = [path for split, path in paths.items() if path.is_file() and not _is_used(folder, split)]
+    return [f"{path}: is not used, because none of its frames has an image" for path in unused]
+
+
 def _times(folder: Path, path: Path, entries: list[dict[str, Any]]) -> Times:
     """Return the times of a file's frames, on the scale of those of all splits."""
-    paths = [transforms_path(folder, split) for split in ("train", "test", "val")]
-    others = {other: read_transforms(other)["frames"] for other in paths if other != path and other.is_file()}
+    paths = [transforms_path(folder, split) for split in ("train", "test", "val") if _is_used(folder, split)]
+    others = {other: read_transforms(other)["frames"] for other in paths if other != path}
     elsewhere = [entry for frames in others.values() for entry in frames]
     if _is_animation(others.get(transforms_path(folder, "train"), entries), [entries, *others.values()]):
         return Times(_numbers_as_times(entries, [*entries, *elsewhere]), ())

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -122,6 +123,22 @@ def test_pictures_of_an_animation_have_the_times_of_its_frames(tmp_path, step):
         expected = [(number - 1) / 11 for number in numbers]
         assert load(tmp_path, split).times.tolist() == pytest.approx(expected, abs=1e-6)
     assert load(tmp_path, "train", frames="::2").times.tolist()[0] == 0.0
+
+
+@pytest.mark.parametrize("listed", [range(1, 13), range(0)])
+def test_held_out_views_that_were_never_rendered(tmp_path, listed):
+    """BlenderNeRF renders training views only: its file of test views lists a camera path, or nothing."""
+    write_animation(tmp_path, range(1, 13), listed)
+    if listed:
+        shutil.rmtree(tmp_path / "test")
+    train, test = load(tmp_path), load(tmp_path, "test")
+    assert [frame.name for frame in test] == ["0005"] and len(train) == 11
+    for data in (train, test):
+        assert any("transforms_test.json: is not used, because none of its frames has" in note for note in data.notes)
+    assert load(tmp_path, "val").times.tolist() == pytest.approx([4 / 11])
+    (tmp_path / "transforms_train.json").unlink()
+    with pytest.raises(UserError, match=r"images of 12 of 12 frames are missing|lists? at least one frame"):
+        load(tmp_path, "test")
 
 
 @pytest.mark.parametrize(
