@@ -2,10 +2,11 @@
 
 ``fl_x, fl_y, cx, cy, w, h`` (pixels; for all frames or in each), per frame ``file_path``, ``transform_matrix``
 (camera-to-world, OpenGL), ``time`` in [0, 1] or else ``timestamp``, ``mask_path`` and ``depth_file_path``
-(``depth_maps``), which instant-ngp calls ``depth_path``, with ``integer_depth_scale`` as its unit;
-``ply_file_path``, sparse points in the frame of the poses; ``train_filenames``, ``val_filenames``,
-``test_filenames``; ``camera_model`` and ``k1`` ... ``k6, p1, p2``, or ``distortion_params``, for all frames or in each
-(images with distortion are undistorted). Layout: Tancik et al., Nerfstudio, SIGGRAPH 2023.
+(``depth_maps``), which instant-ngp calls ``depth_path``, with ``integer_depth_scale`` as its unit; ``ply_file_path``,
+sparse points in the frame of the poses, without which those of a COLMAP model beside it count (``model_points``);
+``train_filenames``, ``val_filenames``, ``test_filenames``; ``camera_model`` and ``k1`` ... ``k6, p1, p2``, or
+``distortion_params``, for all frames or in each (images with distortion are undistorted).
+Layout: Tancik et al., Nerfstudio, SIGGRAPH 2023.
 """
 
 from __future__ import annotations
@@ -29,6 +30,7 @@ from ..held_out import held_out
 from ..images import ReadOptions
 from ..natural_order import by_name
 from ..points import read_points
+from .model_points import points_of_model
 from .transforms import (
     Times,
     find_mask,
@@ -85,7 +87,10 @@ def read(folder: Path, split: str, options: ReadOptions) -> Dataset:
     named = sum(bool(entries[index].get(_depth_keys(content, entries[index])[0])) for index in chosen)
     notes += _of_depth(path, content) + _without_depth(path, named, records)
     data = assemble(records, options, folder=folder, split=split, one_size=True, border=border, notes=notes)
-    return with_points(data, *_points(path, folder, content, data.cameras, np.zeros(3) if offset is None else offset))
+    points = _points(path, folder, content, data.cameras, np.zeros(3) if offset is None else offset)
+    if points is None:
+        points = points_of_model(folder, [files[index].name for index in poses], [*poses.values()])
+    return data if points is None else with_points(data, *points)
 
 
 def _record(
@@ -236,11 +241,11 @@ def _plain(name: str) -> str:
 
 def _points(
     path: Path, folder: Path, content: dict[str, Any], cameras: list[Camera], offset: np.ndarray
-) -> tuple[np.ndarray | None, np.ndarray | None]:
-    """Read points [P, 3] in the frame of the poses, less ``offset``, and their colours [P, 3]; None without points."""
+) -> tuple[np.ndarray, np.ndarray | None] | None:
+    """Read points [P, 3] in the frame of the poses, less ``offset``, and their colours [P, 3]; None without a file."""
     name = content.get("ply_file_path")
     if name is None or name == "":
-        return None, None
+        return None
     if not isinstance(name, str):
         raise UserError(f"{path}: ply_file_path is not text; name the file of points or leave it out")
     points, colors = read_points(inside(folder, name, f"{path}: ply_file_path"))
