@@ -112,6 +112,8 @@ def _exported_by(folder: Path) -> str | None:
             return "Record3D"
     if any(folder.glob("frame_[0-9]*.json")):
         return "3D Scanner App"
+    if (folder / "odometry.csv").is_file() and (folder / "rgb.mp4").is_file():
+        return "Stray Scanner"
     if (folder / "color").is_dir() and any((folder / "camera").glob("*.npz")):
         return "CUT3R"
     if (folder / "camera_poses.txt").is_file() and (folder / "results_output").is_dir():

@@ -84,6 +84,7 @@ def test_a_folder_that_holds_a_film(tmp_path):
         (["EXR_RGBD/metadata", "EXR_RGBD/rgbd/0.jpg"], "Record3D"),
         (["frame_00000.json", *(f"frame_0000{index}.jpg" for index in range(4))], "3D Scanner App"),
         (["pred_traj.txt", *(f"frame_000{index}.png" for index in range(4))], "MonST3R"),
+        (["odometry.csv", "rgb.mp4", "depth/000000.png"], "Stray Scanner"),
         (["camera/000000.npz", "color/000000.png"], "CUT3R"),
         (["camera_poses.txt", "results_output/frame_0.npz"], "DA3-Streaming"),
     ],

@@ -22,7 +22,7 @@ from ...storage.files import read_bytes
 from ...visualization.video import write_png
 from ..similarity import Similarity, upright
 from ..source import read_rgb
-from . import agreement, arrays, frame_folders, monst3r, phone_apps, pi3
+from . import agreement, arrays, frame_folders, monst3r, phone_apps, pi3, stray_scanner
 from .archives import ShowProgress, unpacked
 from .depth_writing import DepthWriter, checked_depth, known_depth
 from .scene import MAX_NUMBER, OPENGL_TO_OPENCV, ImportedFrame, ImportedScene
@@ -66,6 +66,8 @@ def read_scene(path: Path) -> ImportedScene:
     if path.is_dir():
         if monst3r.recognises(path):
             return monst3r.read(path)
+        if stray_scanner.is_stray(path):
+            return stray_scanner.read_stray(path)
         for recognises, read in (*frame_folders.LAYOUTS, *phone_apps.LAYOUTS):
             if recognises(path):
                 return read(path)
@@ -74,7 +76,8 @@ def read_scene(path: Path) -> ImportedScene:
     raise UserError(
         f"--poses {path}: is no scene of MegaSaM, VGGT, Depth Anything 3 or Pi3 (.npz), MonST3R "
         f"({monst3r.TRAJECTORY}), CUT3R (camera, color), DA3-Streaming ({frame_folders.POSES}), Polycam (keyframes), "
-        "Record3D (.r3d; metadata.json, rgb) or 3D Scanner App (frame_00000.json); export one of these"
+        f"Record3D (.r3d; metadata.json, rgb), 3D Scanner App (frame_00000.json) or Stray Scanner "
+        f"({stray_scanner.TRACK}); export one of these"
     )
 
 

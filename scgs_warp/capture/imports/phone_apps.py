@@ -77,7 +77,7 @@ def read_polycam(path: Path) -> ImportedScene:
                 from_arkit(rigid(np.array(rows), f"{file}: t_00 to t_23")),
                 _fitted(file, intrinsics(K, f"{file}: fx, fy, cx, cy"), stated, image),
                 float(int(file.stem)) if file.stem.isdigit() and len(file.stem) < 19 else float(len(frames)),
-                _depth_of(*(base / kind / f"{file.stem}.png" for kind in ("depth", "confidence"))),
+                depth_of(*(base / kind / f"{file.stem}.png" for kind in ("depth", "confidence"))),
             )
         )
     missing = len(files) - len(frames)
@@ -201,7 +201,7 @@ def read_scanner(path: Path) -> ImportedScene:
         K = intrinsics(_row(file, content, "intrinsics", 9).reshape(3, 3), f"{file}: intrinsics")
         moment = _number(file, content, "time") if "time" in content else float(len(frames))
         number = file.stem.split("_")[-1]
-        depth = _depth_of(path / f"depth_{number}.png", path / f"conf_{number}.png")
+        depth = depth_of(path / f"depth_{number}.png", path / f"conf_{number}.png")
         frames.append(ImportedFrame(image, from_arkit(pose), K, moment, depth))
     return ImportedScene("3D Scanner App", frames, gravity=True)
 
@@ -265,7 +265,7 @@ def _fitted(file: Path, K: np.ndarray, stated: tuple[float, float], image: Path)
     return K * np.array([[sx], [sy], [1.0]])
 
 
-def _depth_of(path: Path, sureness: Path) -> Callable[[], np.ndarray] | None:
+def depth_of(path: Path, sureness: Path) -> Callable[[], np.ndarray] | None:
     """Return a function that reads depth in metres from a 16-bit image in millimetres, 0 where the image ``sureness``
     is 0 if there is one; None without the file."""
     if not path.is_file():
