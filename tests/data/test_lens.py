@@ -56,6 +56,21 @@ def test_rays_land_where_opencv_says(case):
     assert lens.distorted
 
 
+@pytest.mark.parametrize("case", ["rational", "fisheye"])
+def test_lenses_of_spectacular_ai(tmp_path, case):
+    """It writes the model under another key, and OpenCV's eight parameters under OPENCV."""
+    model, values = CASES[case]
+    write(tmp_path, model, values)
+    path = tmp_path / "transforms.json"
+    content, expected = json.loads(path.read_text()), load(tmp_path)[0].image
+    name = content.pop("camera_model")
+    path.write_text(json.dumps({**content, "model": name.replace("FULL_", ""), "fx": 70.0}))
+    assert torch.equal(load(tmp_path)[0].image, expected)
+    path.write_text(json.dumps({**content, "model": "iPhone15,2", "k1": 0.0, "k2": 0.0, "k3": 0.0, "k4": 0.5}))
+    with pytest.raises(UserError, match=r"k4 is 0\.5, a lens distortion that camera_model None"):
+        load(tmp_path)
+
+
 @pytest.mark.parametrize("listed", [False, True])
 def test_the_fourth_radial_parameter_of_nerfstudio(tmp_path, listed):
     """Metashape and RealityCapture calibrate it. Without it the lens is OpenCV's; with it, rays move by k4 r^8."""

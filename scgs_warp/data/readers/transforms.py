@@ -149,7 +149,7 @@ def read_distortion(path: Path, fields: dict[str, Any]) -> tuple[str, tuple[floa
     Raises:
         UserError: the camera model is unknown, or the file has parameters that the model does not have.
     """
-    name = fields.get("camera_model")
+    name = _camera_model(fields)
     if name is not None and (not isinstance(name, str) or name.upper() not in (*PERSPECTIVES, *FISHEYES)):
         raise UserError(
             f"{path}: camera_model is {str(name)[:40]!r}, which is not supported; "
@@ -184,6 +184,15 @@ def read_distortion(path: Path, fields: dict[str, Any]) -> tuple[str, tuple[floa
     if kind == "OPENCV_FISHEYE":
         return kind, (k1, k2, k3, k4)
     return kind, (k1, k2, p1, p2, k3, k4) if kind == BROWN4 else (k1, k2, p1, p2, k3, k4, k5, k6)
+
+
+def _camera_model(fields: dict[str, Any]) -> Any:
+    """Return the name of the camera model; None without one. Spectacular AI writes it as ``model``, and OpenCV's eight
+    parameters under ``OPENCV``."""
+    other = fields.get("model")
+    if "camera_model" in fields or not isinstance(other, str) or other.upper() not in (*PERSPECTIVES, *FISHEYES):
+        return fields.get("camera_model")
+    return "FULL_OPENCV" if other.upper() == "OPENCV" else other
 
 
 def _parameter(path: Path, key: str, value: Any) -> float:
