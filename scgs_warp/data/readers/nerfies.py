@@ -72,7 +72,8 @@ def read(folder: Path, split: str, options: ReadOptions) -> Dataset:
     image.
 
     ``test`` and ``val`` are ``val_ids``, which are never trained on; if that list is empty, every eighth id is held
-    out. Times are ``time_id``, scaled to [0, 1] over all listed frames. The camera of a frame is ``camera_id``.
+    out. Times are ``time_id`` or ``warp_id``, scaled to [0, 1] over all listed frames. The camera of a frame is
+    ``camera_id``.
 
     Raises:
         UserError: the data is invalid; one line names the file, the field and the remedy.
@@ -185,7 +186,7 @@ def _times(path: Path, names: list[str]) -> tuple[list[float], list[str]]:
     if not path.is_file():
         return [index / max(len(names) - 1, 1) for index in range(len(names))], [""] * len(names)
     content = read_json(path)
-    values, cameras = [], []
+    values, cameras, keys = [], [], set()
     for name in names:
         entry = content.get(name)
         key = "time_id" if isinstance(entry, dict) and "time_id" in entry else "warp_id"
@@ -193,9 +194,24 @@ def _times(path: Path, names: list[str]) -> tuple[list[float], list[str]]:
         if value is None:
             raise UserError(f"{path}: {name}.{key} is missing or not a number; give each frame its instant")
         values.append(value)
+        keys.add(key)
         camera = as_number(entry.get("camera_id")) if isinstance(entry, dict) else None
         cameras.append("" if camera is None else f"{camera:g}")
+    if keys == {"warp_id"} and len(set(cameras)) == 1:
+        values = _counted(names, values)
     return _scaled(values), cameras
+
+
+def _counted(names: list[str], values: list[float]) -> list[float]:
+    """Return the numbers at the ends of the names of one camera's frames instead of their ``values``, if some values
+    repeat: the notebook of Nerfies gives a held-out frame the ``warp_id`` of the training frame that follows. Names
+    without numbers, or of another order, do not count."""
+    found = [re.search("[0-9]{1,9}$", name) for name in names]
+    numbers = [int(match[0]) for match in found if match is not None]
+    if len(set(values)) == len(values) or len(set(numbers)) < len(names):
+        return values
+    ordered = [value for _, value in sorted(zip(numbers, values))]
+    return [float(number) for number in numbers] if ordered == sorted(values) else values
 
 
 def _scaled(values: list[float]) -> list[float]:

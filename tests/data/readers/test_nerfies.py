@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import bisect
 import json
 
 import cv2
@@ -16,6 +17,7 @@ from helpers.layouts import (
     WIDTH,
     K,
     save_image,
+    save_json,
     share_found,
     viewmat,
     write_nerfies,
@@ -91,6 +93,36 @@ def test_nerfies_times_of_newer_data(tmp_path):
     change(tmp_path / "metadata.json", lambda content: [e.update(time_id=e["warp_id"] // 2) for e in content.values()])
     np.testing.assert_allclose(load(tmp_path).times, np.arange(6) / 5)
     assert torch.equal(load(tmp_path).times, load(tmp_path, "test").times), "two cameras at each instant"
+
+
+def of_notebook(names: list[str], val_ids: list[str]) -> dict[str, dict[str, int]]:
+    """Metadata as the notebook of Nerfies writes them: a held-out frame has the ``warp_id`` of the next one."""
+    train_ids = sorted(set(names) - set(val_ids))
+    ids = {name: index for index, name in enumerate(train_ids)}
+    ids |= {name: bisect.bisect_left(train_ids, name) for name in val_ids}
+    return {name: {"warp_id": ids[name], "appearance_id": ids[name], "camera_id": 0} for name in names}
+
+
+def test_times_of_captures_with_the_notebook(tmp_path):
+    """Held-out frames are not of the moment of a training frame; numbers in the names tell frames that were left out
+    for blur."""
+    write_nerfies(tmp_path)
+    names = [f"{index:06d}" for index in range(1, 13) if index not in (4, 5)]
+    val_ids = names[::4]
+    lists = {"ids": names, "train_ids": sorted(set(names) - set(val_ids)), "val_ids": val_ids}
+    save_json(tmp_path / "dataset.json", lists)
+    save_json(tmp_path / "metadata.json", of_notebook(names, val_ids))
+    for split in ("train", "test"):
+        data = load(tmp_path, split)
+        expected = [(int(frame.name) - 1) / 11 for frame in data]
+        assert data.times.tolist() == pytest.approx(expected, abs=1e-6)
+
+
+def test_instants_that_names_contradict_stay(tmp_path):
+    write_nerfies(tmp_path)
+    metadata = {f"{index:06d}": {"warp_id": [5, 5, 2][index % 3], "camera_id": 0} for index in range(1, 13)}
+    save_json(tmp_path / "metadata.json", metadata)
+    assert set(load(tmp_path).times.tolist()) == {0.0, 1.0}
 
 
 def test_held_out_ids_are_never_trained_on(tmp_path):
