@@ -71,6 +71,28 @@ def test_lenses_of_spectacular_ai(tmp_path, case):
         load(tmp_path)
 
 
+def test_lenses_of_project_aria(tmp_path):
+    """Without tangential and prism parameters, they are OpenCV's fisheyes with two more terms; straight lines stay."""
+    lists = [*FISHEYE.values(), 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0]
+    write(tmp_path, "OPENCV_FISHEYE", FISHEYE)
+    path = tmp_path / "transforms.json"
+    content, expected = json.loads(path.read_text()), load(tmp_path)[0]
+    content = {key: value for key, value in content.items() if key not in FISHEYE}
+    content |= {"camera_model": "FISHEYE624", "distortion_params": lists, "fisheye_crop_radius": 40.0}
+    path.write_text(json.dumps(content))
+    found = load(tmp_path)[0]
+    assert expected.mask is not None and found.mask is not None
+    both = expected.mask & found.mask
+    assert both.float().mean() > 0.7 and torch.allclose(expected.image[both], found.image[both], atol=0.01)
+    prism = [*lists[:6], 0.004, -0.003, 0.01, 0.0, -0.02, 0.0]
+    path.write_text(json.dumps({**content, "distortion_params": prism}))
+    assert not torch.allclose(load(tmp_path)[0].image, found.image, atol=0.005), "they are read"
+    for wrong in (lists[:6], None, [*lists[:11], "wide"]):
+        path.write_text(json.dumps({**content, "distortion_params": wrong}))
+        with pytest.raises(UserError, match=r"distortion_params is .*12 numbers of FISHEYE624|distortion_params\[11\]"):
+            load(tmp_path)
+
+
 @pytest.mark.parametrize("listed", [False, True])
 def test_the_fourth_radial_parameter_of_nerfstudio(tmp_path, listed):
     """Metashape and RealityCapture calibrate it. Without it the lens is OpenCV's; with it, rays move by k4 r^8."""

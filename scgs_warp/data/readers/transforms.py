@@ -28,6 +28,9 @@ PERSPECTIVES = ("PERSPECTIVE", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RA
 and tangential; for FULL_OPENCV the radial part is a quotient of polynomials."""
 FISHEYES = ("OPENCV_FISHEYE", "FISHEYE", "SIMPLE_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
 """Camera models in which the distance from the centre is a polynomial of the angle to the optical axis."""
+PRISM, PRISM_COUNT = "FISHEYE624", 12
+"""nerfstudio's name of the lens of Project Aria, and the number of its parameters in ``distortion_params``: those of
+COLMAP's RAD_TAN_THIN_PRISM_FISHEYE."""
 MOST_SCALE = 1e6
 """Largest scale of a camera that is left out, and the inverse of the smallest one."""
 CORNER = 0.95
@@ -150,10 +153,12 @@ def read_distortion(path: Path, fields: dict[str, Any]) -> tuple[str, tuple[floa
         UserError: the camera model is unknown, or the file has parameters that the model does not have.
     """
     name = _camera_model(fields)
+    if isinstance(name, str) and name.upper() == PRISM:
+        return "RAD_TAN_THIN_PRISM_FISHEYE", _prism(path, fields.get("distortion_params"))
     if name is not None and (not isinstance(name, str) or name.upper() not in (*PERSPECTIVES, *FISHEYES)):
         raise UserError(
             f"{path}: camera_model is {str(name)[:40]!r}, which is not supported; "
-            f"undistort the images to one of {', '.join((*PERSPECTIVES, *FISHEYES))}"
+            f"undistort the images to one of {', '.join((*PERSPECTIVES, *FISHEYES, PRISM))}"
         )
     values = {key: _parameter(path, key, fields.get(key, 0.0)) for key in DISTORTION}
     listed = fields.get("distortion_params")
@@ -184,6 +189,16 @@ def read_distortion(path: Path, fields: dict[str, Any]) -> tuple[str, tuple[floa
     if kind == "OPENCV_FISHEYE":
         return kind, (k1, k2, k3, k4)
     return kind, (k1, k2, p1, p2, k3, k4) if kind == BROWN4 else (k1, k2, p1, p2, k3, k4, k5, k6)
+
+
+def _prism(path: Path, listed: Any) -> tuple[float, ...]:
+    """Return the parameters of a lens of Project Aria."""
+    if not isinstance(listed, list) or len(listed) != PRISM_COUNT:
+        raise UserError(
+            f"{path}: distortion_params is {repr(listed)[:60]}; give the {PRISM_COUNT} numbers of {PRISM}: k0 to k5, "
+            "p0, p1, s0 to s3"
+        )
+    return tuple(_parameter(path, f"distortion_params[{index}]", value) for index, value in enumerate(listed))
 
 
 def _camera_model(fields: dict[str, Any]) -> Any:
