@@ -111,6 +111,11 @@ def read_record3d(path: Path) -> ImportedScene:
     file, folder = place
     content = read_json(file, "export the capture again")
     poses = _table(file, content, "poses", 7)
+    if len(poses) > 1 and (poses == poses[0]).all():
+        raise UserError(
+            f"{file}: all poses are the same, because the app knows none of the camera that sees faces; find them by "
+            f"the images in its folder {folder.name}: scgs-warp capture FOLDER --output DIR"
+        )
     images = _paired(file, folder, len(poses))
     if "perFrameIntrinsicCoeffs" in content:
         lenses = _table(file, content, "perFrameIntrinsicCoeffs", 4)

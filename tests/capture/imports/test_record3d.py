@@ -32,6 +32,16 @@ def test_images_of_record3d_that_are_missing(tmp_path):
         phone_apps.read_record3d(record)
 
 
+def test_recordings_without_poses_are_refused(tmp_path):
+    """Of the camera that sees faces, the app writes the identity for each frame."""
+    record = write_record3d(tmp_path / "record3d")
+    still = [[0, 0, 0, 1, 0, 0, 0]] * COUNT
+    change(record / "metadata.json", lambda content: content.update(poses=still))
+    refused(record, tmp_path, "all poses are the same, .* images in its folder rgb: scgs-warp capture FOLDER")
+    change(record / "metadata.json", lambda content: content.update(poses=[*still[1:], [0, 0, 0, 1, 0.1, 0, 0]]))
+    assert import_scene(record, tmp_path / "data", silent).frames == COUNT
+
+
 def test_the_folder_above_an_export_of_record3d(tmp_path):
     """Its depth is found there, too."""
     pytest.importorskip("OpenEXR")
