@@ -88,6 +88,9 @@ def no_layout(folder: Path, recognised: Callable[[Path], bool]) -> UserError:
             f"{folder}: is an export of {program}; make a data set of it: scgs-warp capture --poses "
             f"{shell_words(folder)} --output {shell_words(f'data/{folder.resolve().name}')}"
         )
+    renamed = next((entry for entry in entries if entry.match("transform*.json") and entry.is_file()), None)
+    if renamed is not None:
+        return UserError(f"{renamed}: is read under another name; call it transforms.json if it lists frames and poses")
     if sum(entry.suffix.lower() in IMAGES for entry in entries) >= FEWEST_PHOTOS:
         return UserError(
             f"{folder}: holds images without cameras; find them with: scgs-warp capture {shell_words(folder)} --output "

@@ -76,6 +76,16 @@ def test_a_folder_that_holds_a_film(tmp_path):
         load(tmp_path)
 
 
+def test_a_file_of_cameras_under_another_name(tmp_path):
+    """Older scripts of Spectacular AI write ``transformations.json``."""
+    (tmp_path / "images").mkdir()
+    (tmp_path / "transformations.json").write_text("{}")
+    assert said(tmp_path) == (
+        f"{tmp_path / 'transformations.json'}: is read under another name; call it transforms.json if it lists frames "
+        "and poses"
+    )
+
+
 @pytest.mark.parametrize(
     ("files", "program"),
     [
