@@ -19,19 +19,16 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from torch import Tensor
 
 from ...errors import UserError
 from ...storage.json_files import as_number, read_json
-from ..dataset import Dataset, spread
-from ..depth_cloud import depth_cloud
+from ..dataset import Dataset
+from ..depth_points import points_of_depth
 
 TRAIN, VAL, EXTRA = "splits/train.json", "splits/val.json", "extra.json"
 COVISIBLE = ("covisible", "flow3d_preprocessed/covisible")
 """Folders of masks: those of DyCheck, and those of Shape of Motion, for images of full size."""
-POINT_FRAMES = 24
-"""Number of frames whose depth gives initial points."""
-POINT_COUNT = 100_000
-"""Number of points, from all these frames together."""
 MOST_BEYOND = 50.0
 """How many times farther than ``far`` in ``scene.json`` the median of a depth map may be."""
 
@@ -125,20 +122,12 @@ def lidar_points(folder: Path, data: Dataset) -> tuple[np.ndarray, np.ndarray] |
     Raises:
         UserError: a map is damaged, does not fit its image, or has another unit than the cameras.
     """
-    chosen = [data.with_depth[place] for place in spread(len(data.with_depth), POINT_FRAMES)]
-    clouds = []
-    for index in chosen:
-        depth, frame = data.depth(index), data[index]
-        assert depth is not None, "asked for frames with a depth map only"
-        known = depth[depth > 0]
-        if data.bounds is not None and len(known) and float(known.median()) > MOST_BEYOND * data.bounds[1]:
+
+    def check(name: str, known: Tensor) -> None:
+        if data.bounds is not None and float(known.median()) > MOST_BEYOND * data.bounds[1]:
             raise UserError(
-                f"{folder / 'depth'}: {frame.name} is {float(known.median()) / data.bounds[1]:.0f} times as far away "
+                f"{folder / 'depth'}: {name} is {float(known.median()) / data.bounds[1]:.0f} times as far away "
                 "as far in scene.json says; give depth in the units of the cameras (metres, not millimetres)"
             )
-        camera = frame.camera
-        K, viewmat = camera.K.double().numpy(), camera.viewmat.double().numpy()
-        clouds.append(depth_cloud(depth.numpy(), frame.image.numpy(), K, viewmat, POINT_COUNT // len(chosen)))
-    if not any(len(points) for points, _ in clouds):
-        return None
-    return np.concatenate([points for points, _ in clouds]), np.concatenate([colors for _, colors in clouds])
+
+    return points_of_depth(data, check)

@@ -25,6 +25,7 @@ from ..assemble import FrameRecord, assemble, video_border, with_points
 from ..choice import choose
 from ..dataset import Dataset
 from ..depth_maps import MILLIMETRE, DepthFile
+from ..depth_points import points_of_depth
 from ..far_origin import moved, note, offset_of
 from ..held_out import held_out
 from ..images import ReadOptions
@@ -90,6 +91,8 @@ def read(folder: Path, split: str, options: ReadOptions) -> Dataset:
     points = _points(path, folder, content, data.cameras, np.zeros(3) if offset is None else offset)
     if points is None:
         points = points_of_model(folder, [files[index].name for index in poses], [*poses.values()])
+    if points is None and split == "train" and not data.with_alpha:  # a cut-out subject is found without points
+        points = points_of_depth(data, agreeing=True)
     return data if points is None else with_points(data, *points)
 
 
