@@ -50,7 +50,7 @@ class Options:
     size: int = 512
     """Longer side of the film in pixels; the proportions are those of the training images."""
     fps: float = 30.0
-    """Frames per second."""
+    """Frames per second; at most 50 in a .gif."""
     time: float | None = None
     """Time that a turntable shows, from 0 to 1; 0.5 by default. With a time, --mode is turntable."""
     frame: Literal["auto", "cameras", "subject"] = "auto"

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import shutil
+import struct
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from fractions import Fraction
@@ -28,6 +30,8 @@ GIF_PIXEL_BYTES = 4
 SLOWEST = 0.01
 """Least number of frames a second. A GIF's frame lasts at most 655 seconds, and an MP4's rate is a fraction with a
 denominator of at most 1,000."""
+FASTEST_GIF = 50
+"""Largest number of frames a second of a GIF: browsers slow down what changes after less than 2 hundredths of one."""
 FRAME_NAME = "frame_{:05d}.png"
 FRAME_PATTERN = r"frame_\d{5,}\.png"
 
@@ -206,11 +210,23 @@ class _Gif(FilmWriter):
         pictures = [
             Image.fromarray(frame).quantize(palette=palette, dither=Image.Dither.FLOYDSTEINBERG) for frame in self._kept
         ]
-        # GIF durations are hundredths of a second; browsers slow down films with less than two.
-        duration = 10 * max(2, round(100 / self.fps))
-        pictures[0].save(
-            self.temporary, format="GIF", save_all=True, append_images=pictures[1:], duration=duration, loop=0
-        )
+        try:
+            pictures[0].save(
+                self.temporary, format="GIF", save_all=True, append_images=pictures[1:], loop=0,
+                duration=gif_durations(len(pictures), self.fps),
+            )  # fmt: skip
+        except (OverflowError, struct.error):  # The duration of equal frames, which Pillow joins, has 16 bits.
+            raise UserError(
+                f"{self.path}: stands still for more than 655 s, the longest that a picture of a GIF can last; end the "
+                "name in .mp4"
+            ) from None
+
+
+def gif_durations(frames: int, fps: float) -> list[int]:
+    """Return how long each frame of a GIF is shown, in milliseconds. A GIF counts hundredths of a second; each frame
+    ends at the one that is nearest to its end, so that rounding never adds up."""
+    ends = [round(100 * k / fps) for k in range(frames + 1)]
+    return [10 * (end - begin) for begin, end in itertools.pairwise(ends)]
 
 
 class _Folder(FilmWriter):
@@ -255,12 +271,18 @@ def film(path: str | Path, fps: float = 30, *, quality: int = QUALITY) -> Iterat
         A writer; pass each frame to its ``write``.
 
     Raises:
-        UserError: as ``check_path``; the disk is full, no frame was written, or ``fps`` is out of range.
+        UserError: as ``check_path``; the disk is full, no frame was written, or ``fps`` is out of range (of a .gif:
+            over 50), or a .gif stands still for too long.
         Exception: exceptions of the body of the ``with`` pass unchanged.
     """
     path = check_path(path)
     if not SLOWEST <= fps <= 1000:
         raise UserError(f"fps is {fps}; give {SLOWEST} to 1000 frames a second")
+    if path.suffix.lower() == ".gif" and fps > FASTEST_GIF:
+        raise UserError(
+            f"{path}: a GIF shows at most {FASTEST_GIF} frames a second, and {fps:g} are asked for; give fewer (--fps, "
+            "or film.fps in an edit), or end the name in .mp4"
+        )
     writers = {".mp4": _Mp4, ".gif": _Gif, "": _Folder}
     writer = writers[path.suffix.lower()](path, fps, quality)
     try:

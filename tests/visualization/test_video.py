@@ -77,6 +77,28 @@ def test_gif_plays_and_loops(tmp_path: Path) -> None:
             assert (found[9:15, 5 + 2 * index : 11 + 2 * index] > 240).all()  # the square has walked
 
 
+@pytest.mark.parametrize("fps", [7.0, 29.97, 30.0, 40.0, 49.9, 50.0])
+def test_a_gif_lasts_as_long_as_the_film(tmp_path: Path, fps: float) -> None:
+    """At 30 frames a second, frames of 3 hundredths each would play a tenth too fast."""
+    from PIL import Image, ImageSequence
+
+    write(tmp_path / "film.gif", frames(20, 24, 60), fps=fps)
+    with Image.open(tmp_path / "film.gif") as picture:
+        shown = [frame.info["duration"] for frame in ImageSequence.Iterator(picture)]
+    assert sum(shown) == pytest.approx(1000 * 20 / fps, abs=5)
+    assert min(shown) >= 20 and max(shown) - min(shown) <= 10
+
+
+def test_what_no_gif_can_show_is_refused(tmp_path: Path) -> None:
+    still = [np.full((16, 16, 3), 128, np.uint8)] * 7
+    with pytest.raises(UserError, match=r"film\.gif: a GIF shows at most 50 frames a second, and 60 .*--fps"):
+        write(tmp_path / "film.gif", still, fps=60)
+    with pytest.raises(UserError, match=r"film\.gif: stands still for more than 655 s"):
+        write(tmp_path / "film.gif", still, fps=0.01)
+    assert list(tmp_path.iterdir()) == []
+    write(tmp_path / "film", still, fps=60)
+
+
 def test_folder_of_pngs_is_lossless_and_replaced_as_a_whole(tmp_path: Path) -> None:
     import cv2
 
