@@ -42,6 +42,8 @@ class Outcome(NamedTuple):
     """Share of pixels that are masked."""
     exhaustive: bool = False
     """True if each frame was matched with each."""
+    whole: bool = False
+    """True if the source has no further frames of use, so that a larger --frames would pick the same."""
 
 
 def likely_reason(outcome: Outcome) -> str:
@@ -62,15 +64,18 @@ def likely_reason(outcome: Outcome) -> str:
     if outcome.masked > 0.3 and (links.linked < MIN_LINKED or links.inliers < MIN_INLIERS):
         return f"masks hide {100 * outcome.masked:.0f} % of the frames: give --masks none, or masks of your own"
     if links.linked < MIN_LINKED or links.inliers < MIN_INLIERS:
+        more = "" if outcome.whole else f"give --frames {2 * outcome.picked}, "
         return (
-            f"frames that follow each other have little in common ({links.inliers} matches): give --frames "
-            f"{2 * outcome.picked}, film more slowly, or use a part without cuts (--start, --end)"
+            f"frames that follow each other have little in common ({links.inliers} matches): {more}film more slowly, "
+            "or use a part without cuts (--start, --end)"
         )
     if links.planar > MAX_PLANAR or (outcome.registered and outcome.arc < MIN_ARC):
         return "the camera turns but hardly moves: film from several places, walking sideways around the scene"
     if outcome.registered >= 2:
-        more = f"--frames {2 * outcome.picked}" if outcome.exhaustive else "--matching exhaustive"
-        return f"the film falls into parts that do not connect: give {more}, or use a part (--start, --end)"
+        more = f"give --frames {2 * outcome.picked}, or " if outcome.exhaustive else "give --matching exhaustive, or "
+        if outcome.exhaustive and outcome.whole:
+            more = ""
+        return f"the film falls into parts that do not connect: {more}use a part (--start, --end)"
     return "no two frames gave a beginning: give --fov if you know it, or film with more movement"
 
 

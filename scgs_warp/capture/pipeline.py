@@ -20,7 +20,7 @@ from .features import FrameFiles
 from .folder_content import photographs_left_out
 from .given_masks import read_masks
 from .journal import Journal, disk_errors
-from .picked_frames import PickedFrames, ShowProgress, pick_frames
+from .picked_frames import VIDEO_FRAMES, PickedFrames, ShowProgress, pick_frames
 from .request import MIN_FRAMES, CaptureRequest, check
 from .source import Source, is_hidden, open_source, read_rgb
 
@@ -177,7 +177,8 @@ def _solve(
     masked = 0.0 if frame_files.masks is None else _share(journal)
     registered, arc = (len(solved.places), solved.arc) if solved else (0, 0.0)
     exhaustive = len(chosen) == count * (count - 1) // 2
-    return Outcome(count, registered, arc, features.links(database, frame_files), masked, exhaustive), solved
+    whole = frames.seen <= (request.frames or (VIDEO_FRAMES if source.video else frames.seen))
+    return Outcome(count, registered, arc, features.links(database, frame_files), masked, exhaustive, whole), solved
 
 
 def _share(journal: Journal) -> float:

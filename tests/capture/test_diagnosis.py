@@ -22,6 +22,12 @@ def test_the_likeliest_reason_is_given():
     assert "stands still" in notes(Outcome(50, 50, 9, LINKS._replace(moved=0.0004), 0.1))[0]
     assert "--matching" in likely_reason(Outcome(50, 20, 9, LINKS, 0.1))
     assert "give --frames 100, or" in likely_reason(Outcome(50, 20, 9, LINKS, 0.1, True)), "matching was exhaustive"
+    for alone in (
+        Outcome(12, 0, 0, Links(2000, 0, 0.0, 0.2), 0.1, True, True),
+        Outcome(12, 5, 9, LINKS, 0.1, True, True),
+    ):
+        assert "--frames" not in (said := likely_reason(alone)) and "part" in said, "there are no more frames"
+    assert "--matching" in likely_reason(Outcome(50, 20, 9, LINKS, 0.1, False, True))
     line = too_few("out", Outcome(50, 20, 9, LINKS, 0.1))
     assert line.startswith("out: 20 of 50 frames registered") and "--least 0.4 " in line
     assert "--least" not in too_few("out", Outcome(50, 0, 0, LINKS, 0.1))
