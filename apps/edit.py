@@ -188,6 +188,7 @@ def play_motion(session: EditSession, options: Options, device: str) -> None:
     """Play the motion of a run or of a glTF character on the session's scene, frozen where its edit freezes it."""
     from scgs_warp.edit import EditSession, motion_of_gltf, motion_of_session, retarget
     from scgs_warp.edit.retarget import read_match
+    from scgs_warp.errors import UserError
     from scgs_warp.scene.scene import Scene
 
     assert options.motion is not None
@@ -199,7 +200,10 @@ def play_motion(session: EditSession, options: Options, device: str) -> None:
     if not motion.moves:
         print(f"note: {options.motion}: nothing moves in it, so the scene takes one pose", file=sys.stderr)
     match = None if options.match is None else read_match(options.match)
-    matched = retarget(session, motion, match, session.edit.playback.freeze or 0.0)
+    try:
+        matched = retarget(session, motion, match, session.edit.playback.freeze or 0.0)
+    except UserError as error:
+        raise UserError(f"{options.match or options.motion}: {error}") from None
     print(f"{options.motion}: plays on {', '.join(matched)}", flush=True)
 
 

@@ -17,12 +17,16 @@ from ..storage.json_files import parse_json
 MAX_BYTES = 64 << 20
 """Largest size of an edit file in bytes."""
 _JOINERS: dict[int, str | None] = {0x200C: None, 0x200D: None}
+EDIT = "give an edit's JSON"
 MAX_NUMBER = 1e9
 """Largest magnitude of numbers without a limit of their own; beyond it float32 cannot resolve a scene."""
 
 
-def read_object(path: Path) -> dict[str, Any]:
+def read_object(path: Path, remedy: str = EDIT) -> dict[str, Any]:
     """Read the JSON object in a file.
+
+    Args:
+        remedy: what errors say to give instead.
 
     Raises:
         UserError: the file is missing, too large, not JSON, or not an object.
@@ -30,15 +34,15 @@ def read_object(path: Path) -> dict[str, Any]:
     try:
         text = read_text(path, MAX_BYTES)
     except FileNotFoundError:
-        raise UserError(f"{path}: no such file; give an edit's JSON") from None
+        raise UserError(f"{path}: no such file; {remedy}") from None
     except OSError as error:
-        raise UserError(f"{path}: cannot be read ({error.strerror}); give an edit's JSON") from None
+        raise UserError(f"{path}: cannot be read ({error.strerror}); {remedy}") from None
     except UnicodeDecodeError:
-        raise UserError(f"{path}: is no UTF-8 text; give an edit's JSON") from None
-    return parse_object(text, str(path))
+        raise UserError(f"{path}: is no UTF-8 text; {remedy}") from None
+    return parse_object(text, str(path), remedy)
 
 
-def parse_object(text: str, path: str) -> dict[str, Any]:
+def parse_object(text: str, path: str, remedy: str = EDIT) -> dict[str, Any]:
     """Parse a text as a JSON object; errors name ``path``.
 
     Raises:
@@ -52,7 +56,7 @@ def parse_object(text: str, path: str) -> dict[str, Any]:
     except ValueError as error:
         raise UserError(f"{path}: not valid JSON ({str(error)[:80] or 'nested too deeply'}); correct it") from None
     if not isinstance(content, dict):
-        raise UserError(f"{path}: must hold a JSON object; give an edit's JSON")
+        raise UserError(f"{path}: must hold a JSON object; {remedy}")
     return content
 
 

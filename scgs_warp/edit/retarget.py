@@ -67,7 +67,8 @@ def retargeted(edit: Edit, stance: Stance, motion: BodyMotion, match: Mapping[st
     if not match:
         raise UserError(
             f"no part of the motion is matched: its parts are {', '.join(motion.names)}, those of the scene are "
-            f"{', '.join(skeleton.names)}; say which belong together (--match)"
+            f"{', '.join(skeleton.names)}; say which belong together (--match; names that nobody "
+            "gave, such as part-3, say nothing of another body)"
         )
     motion = motion.turned(least_turn(np.array(UP), stance.up))
     source = {skeleton.part(name).name: motion.row(other) for name, other in match.items()}
@@ -168,9 +169,9 @@ def read_match(path: Path) -> dict[str, str]:
     Raises:
         UserError: the file cannot be read, or a value is not a name.
     """
-    content = read_object(path)
+    remedy = 'write {"part of the scene": "part of the motion", ...}'
+    content = read_object(path, remedy)
     for name, other in content.items():
         if not isinstance(other, str):
-            remedy = 'write {"part of the scene": "part of the motion", ...}'
             raise UserError(f"{path}: {one_line(name)} is {show_value(other)}; {remedy}")
     return dict(content)

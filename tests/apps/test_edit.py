@@ -124,6 +124,24 @@ def test_a_motion_in_which_nothing_moves_is_named(ply, tmp_path, monkeypatch, ca
     assert capsys.readouterr().err == f"note: {tmp_path}: nothing moves in it, so the scene takes one pose\n"
 
 
+@pytest.mark.parametrize(
+    ("match", "said"),
+    [
+        ('{"tail": "part-1"}', "no part is called 'tail'; there is part-1"),
+        ('{"part-1": "tail"}', "has no part 'tail'"),
+        ("{}", "no part of the motion is matched"),
+        ("[]", 'must hold a JSON object; write {"part of the scene": "part of the motion", ...}'),
+    ],
+)
+def test_a_wrong_match_is_named(ply, tmp_path, monkeypatch, capsys, match, said):
+    monkeypatch.setattr("scgs_warp.scene.scene.Scene.load", lambda *_, **__: bar_scene())
+    (tmp_path / "match.json").write_text(match)
+    command = ["--ply", str(ply), "--nodes", "40", "--motion", str(tmp_path), "--match", str(tmp_path / "match.json")]
+    assert app.cli([*command, "--skeleton"]) == 2
+    error = capsys.readouterr().err
+    assert error.startswith(f"error: {tmp_path / 'match.json'}: ") and said in error and error.count("\n") == 1
+
+
 def test_a_wrong_script_stops_the_app(ply, tmp_path, capsys):
     (tmp_path / "edit.json").write_text('{"format": "scgs-warp edit", "version": 1, "film": {"fps": -1}}')
     arguments = ["--ply", str(ply), "--script", str(tmp_path / "edit.json"), "--output", str(tmp_path / "film.mp4")]
