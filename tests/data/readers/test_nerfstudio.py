@@ -223,11 +223,12 @@ def test_images_that_were_converted(tmp_path):
     assert not load(tmp_path).notes, "names without a suffix are of any"
 
 
-def test_times_in_seconds(tmp_path):
+@pytest.mark.parametrize(("first", "length"), [(1700000000.0, 12.5), (-0.5, 1.0)])
+def test_times_in_seconds(tmp_path, first, length):
     content = write(tmp_path)
     expected = load(tmp_path).times
     for frame in content["frames"]:
-        frame["time"] = 1700000000.0 + 12.5 * frame["time"]
+        frame["time"] = first + length * frame["time"]
     save(tmp_path, content)
     data = load(tmp_path)
     assert torch.allclose(data.times, expected) and "are scaled to go from 0 to 1" in data.notes[0]
