@@ -50,6 +50,23 @@ class Options:
     in bands, and what does not fit is refused with an error that names its size."""
 
 
+def check(options: Options) -> None:
+    """Refuse impossible options before anything is loaded, and make the folder of --json.
+
+    Raises:
+        UserError: names the option and the remedy.
+    """
+    from scgs_warp.errors import UserError
+    from scgs_warp.storage.output_folders import make_parent
+
+    if options.also and options.split == "train":
+        raise UserError("--also: scores held-out views; leave --split train out")
+    if options.json is not None:
+        if options.json.is_dir():
+            raise UserError(f"--json {options.json}: is a folder; name a file, as {options.json / 'metrics.json'}")
+        make_parent(options.json)
+
+
 def load_data(scene: Scene, options: Options) -> Dataset:
     """Load the split with the size, the choice and, unless another is given, the background of the training images.
 
@@ -151,9 +168,9 @@ def show(metrics: dict[str, Any], unfinished: str | None) -> None:
 
 def main(args: list[str] | None) -> None:
     options = parse(Options, "evaluate", args)
+    check(options)
     device = prepare(options.device, options.threads, options.memory_gib)
 
-    from scgs_warp.errors import UserError
     from scgs_warp.evaluation.coverage import coverage_line
     from scgs_warp.evaluation.evaluate import metrics_of, write_metrics
     from scgs_warp.evaluation.run_time import training_seconds
@@ -161,8 +178,6 @@ def main(args: list[str] | None) -> None:
     from scgs_warp.scene.frame_colors import FrameColors
     from scgs_warp.scene.mean import load_mean
 
-    if options.also and options.split == "train":
-        raise UserError("--also: scores held-out views; leave --split train out")
     runs = [options.run, *options.also]
     scene = load_mean(runs, device)
     lpips = None

@@ -82,3 +82,9 @@ def test_a_run_that_cannot_be_written_is_scored_alone(trained, tmp_path):
     done = run_app("evaluate", "--run", str(run), "--json", str(path), "--device", "cpu")
     assert done.returncode == 0 and "so that no renders are kept" in done.stdout, done.stderr
     assert json.loads(path.read_text())["psnr"] == json.loads((trained / "metrics.json").read_text())["psnr"]
+
+
+def test_a_folder_in_place_of_the_file_for_metrics_is_refused_before_the_run_is_read(tmp_path):
+    done = run_app("evaluate", "--run", str(tmp_path / "missing"), "--json", str(tmp_path))
+    line = f"error: --json {tmp_path}: is a folder; name a file, as {tmp_path / 'metrics.json'}\n"
+    assert (done.returncode, done.stderr) == (2, line)
