@@ -214,6 +214,8 @@ class GltfFile:
 
 def _checked(path: Path) -> dict[str, Any]:
     """Parse the document as JSON and check the types of its fields."""
+    if path.is_dir():
+        raise UserError(f"{path}: is a folder; name a .glb or .gltf file with --mesh")
     if not path.is_file():
         raise UserError(f"{path}: no such file; give a .glb or .gltf with --mesh")
     if path.suffix.lower() not in (".glb", ".gltf"):

@@ -80,3 +80,8 @@ def test_images_that_do_not_decode(tmp_path):
     glb.binary[start : start + 8] = b"nonsense"
     with pytest.raises(UserError, match="images\\[0\\] \\(image/png\\) does not decode"):
         read_scene(glb.save(tmp_path / "x.glb"))
+
+
+def test_a_folder_is_said_to_be_one(tmp_path):
+    with pytest.raises(UserError, match=r"is a folder; name a .glb or .gltf file with --mesh"):
+        read_scene(tmp_path)
