@@ -126,6 +126,7 @@ def find_scenes(folders: tuple[Path, ...], named: str | None, device: str) -> di
 def make_cells(options: Options, device: str) -> list[Cell]:
     """Plan and check all cells before the first is trained."""
     from scgs_warp.ablation.cells import parse_seeds, parse_values, plan
+    from scgs_warp.config.validation import check_node_count
 
     config, named = configuration(with_usual_steps(options), options.config, {}, "cpu")
     shared = {"seeds": parse_seeds(words(options.seeds)), "device": device, "lpips_weights": options.lpips_weights}
@@ -136,6 +137,8 @@ def make_cells(options: Options, device: str) -> list[Cell]:
     if options.ablation == "zoo":
         return make_zoo_cells(options, config, shared)
     values = parse_values(options.ablation, words(options.values))
+    for value in values if options.ablation == "nodes" else ():
+        check_node_count(int(value), config.motion.neighbors, "--values")
     scenes = find_scenes(options.data, named, device)
     return plan(options.ablation, config, scenes, options.output, values=values, **shared)
 

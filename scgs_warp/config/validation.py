@@ -32,6 +32,25 @@ def check(config: TrainConfig) -> TrainConfig:
     return config
 
 
+def check_node_count(nodes: int, neighbors: int, option: str) -> None:
+    """Refuse a number of control points.
+
+    Args:
+        neighbors: number of control points that a Gaussian follows.
+        option: where the number was given, for the message.
+
+    Raises:
+        UserError: there are too few for the neighbours, or too many.
+    """
+    if nodes < neighbors + 1:
+        raise UserError(f"{option} {nodes}: needs at least {neighbors + 1}")
+    if nodes > MOST_NODES:
+        raise UserError(
+            f"{option} {nodes}: choose at most {MOST_NODES}; a Gaussian follows {neighbors} of them, and sampling more "
+            "takes hours"
+        )
+
+
 def _check_rules(config: TrainConfig) -> None:
     motion = config.motion
     if config.main_steps < 1:
@@ -44,13 +63,7 @@ def _check_rules(config: TrainConfig) -> None:
         raise UserError(f"motion.plane_times is {motion.plane_times}; choose 2 to 4096, or 0 for half of the times")
     if motion.chunks > 1 and motion.model not in ("control-points", "per-gaussian"):
         raise UserError(f"motion.chunks is {motion.chunks}; --motion {motion.model} has no network: leave it out")
-    if motion.nodes < motion.neighbors + 1:
-        raise UserError(f"--nodes {motion.nodes}: needs at least {motion.neighbors + 1}")
-    if motion.nodes > MOST_NODES:
-        raise UserError(
-            f"--nodes {motion.nodes}: choose at most {MOST_NODES}; a Gaussian follows {motion.neighbors} of them, and "
-            "sampling more takes hours"
-        )
+    check_node_count(motion.nodes, motion.neighbors, "--nodes")
     if config.densify.max_gaussians < 100:
         raise UserError(f"--max-gaussians {config.densify.max_gaussians}: needs at least 100")
 

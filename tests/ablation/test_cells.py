@@ -228,7 +228,8 @@ def test_whatever_goes_wrong_comes_back_as_one_line(tmp_path):
     ("arguments", "named"),
     [
         (["nodes", "--values", "64,many"], "--values 'many'"),
-        (["nodes", "--values", "2"], "2"),
+        (["nodes", "--values", "2"], "--values 2: needs at least"),
+        (["nodes", "--values", "9999999"], "--values 9999999: choose at most"),
         (["motion", "--values", "fluid"], "--values 'fluid'"),
         (["arap", "--values", "half"], "on, off, per-gaussian"),
         (["nodes", "--nodes", "64"], "--nodes 64"),
