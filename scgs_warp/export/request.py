@@ -103,10 +103,10 @@ class ExportRequest:
     at: float | None = None
     """With --edit: the second of the edit's film that a still shows; 0 by default."""
     frames: int | None = None
-    """Frame count of a sequence or an animation, evenly from time 0 to 1; 60 by default, with --edit that of its
-    film."""
+    """Frame count of a sequence or an animation, evenly from time 0 to 1; 60 by default. Not with --edit, whose film
+    has its own."""
     fps: float | None = None
-    """Frames per second of an animation; 30 by default."""
+    """Frames per second of an animation; 30 by default. Not with --edit, whose film has its own."""
     spz_version: Literal[3, 4] | None = None
     """Version of a .spz; 4 by default, 3 for readers that know no newer one."""
     pose: bool = False
@@ -193,7 +193,9 @@ def check_request(request: ExportRequest) -> None:
     if request.at is not None and not 0 <= request.at <= 3600:
         raise UserError(f"--at {request.at:g}: give a second of the film, from 0 to 3600")
     if request.edit is not None and (request.frames, request.fps) != (None, None):
-        raise UserError("--frames, --fps: an edit's film says how long it is; change film in the edit")
+        given, field = ("--fps", "fps") if request.frames is None else ("--frames", "seconds or film.fps")
+        remedy = f"leave it out, or change film.{field} in {request.edit}"
+        raise UserError(f"{given}: the film of an edit has its own; {remedy}")
     if request.frames is not None and not 1 <= request.frames <= MAX_FRAMES:
         raise UserError(f"--frames {request.frames}: give 1 to {MAX_FRAMES}")
     if request.fps is not None and not SLOWEST <= request.fps <= 1000:

@@ -39,6 +39,8 @@ def test_mistakes_are_one_line_and_leave_nothing(run, tmp_path, capsys):
         (["--run", run, "--output", "b.glb", "--time", 0.2, "--frames", 10], "leave out --time"),
         (["--ply", "a.ply", "--output", "b.glb", "--fps", 10], "--fps: "),
         (["--run", run, "--output", "b.html", "--frames", 9], "--frames: --format html has no frames"),
+        (["--run", run, "--output", "b.glb", "--edit", "e.json", "--frames", 9], "--frames: the film of an edit"),
+        (["--run", run, "--output", "b.glb", "--edit", "e.json", "--fps", 9], "change film.fps in e.json"),
         (["--run", run, "--output", "b.htm", "--fps", 9], "--fps: --format html has no frames"),
         (["--run", run, "--output", "b.json", "--fps", 9], "--fps: --format cameras has no frames"),
         (["--run", run, "--output", "b", "--format", "ply-sequence", "--fps", 9], "--fps: a ply-sequence"),
