@@ -48,7 +48,8 @@ class Options:
     nodes: int | None = None
     """Number of control points to make for a scene without motion; 512 by default."""
     size: int | None = None
-    """Longer side of the film in pixels, instead of the script's."""
+    """Longer side of the film in pixels, instead of the script's; both sides are rounded to even numbers, which an
+    .mp4 needs."""
     port: int | None = None
     """Port of the editor on 127.0.0.1, 8080 by default; if it is taken, the next free one. With --share, the port for
     other machines."""

@@ -48,7 +48,8 @@ class Options:
     frames: int | None = None
     """Frame count of the film; 120 by default, with --path that of the path."""
     size: int = 512
-    """Longer side of the film in pixels; the proportions are those of the training images."""
+    """Longer side of the film in pixels; the proportions are those of the training images. An .mp4 needs even numbers
+    of pixels, to which its sides are rounded."""
     fps: float = 30.0
     """Frames per second; at most 50 in a .gif."""
     time: float | None = None
@@ -171,11 +172,14 @@ def film_views(options: Options, scene: Scene) -> list[tuple[Camera, float]]:
     """
     from scgs_warp.data.camera_path import read_camera_path
     from scgs_warp.geometry.cameras import orbit_camera, turntable
+    from scgs_warp.visualization import video
     from scgs_warp.visualization.framing import aim, frame_subject, framed
 
+    assert options.output is not None
     given: list[float | None]
+    step = video.size_step(options.output)
     if options.path is not None:
-        film = read_camera_path(options.path, scene.overview).film(options.frames, options.size)
+        film = read_camera_path(options.path, scene.overview).film(options.frames, options.size, step)
         path, given = [camera for camera, _ in film], [time for _, time in film]
     else:
         overview = scene.overview
@@ -186,9 +190,9 @@ def film_views(options: Options, scene: Scene) -> list[tuple[Camera, float]]:
         overview = aim(overview, options.target, options.zoom)
         frames = FRAMES if options.frames is None else options.frames
         if options.mode == "time":
-            path = [orbit_camera(overview, overview.azimuth, options.size)] * frames
+            path = [orbit_camera(overview, overview.azimuth, options.size, step=step)] * frames
         else:
-            path = turntable(overview, frames, options.size)
+            path = turntable(overview, frames, options.size, step=step)
         given = [None] * frames
     if options.mode == "turntable" or options.time is not None:
         return [(camera, 0.5 if options.time is None else options.time) for camera in path]

@@ -45,15 +45,16 @@ class CameraPath(NamedTuple):
     aspect: float
     """Width divided by height."""
 
-    def film(self, frames: int | None, size: int) -> list[tuple[Camera, float | None]]:
+    def film(self, frames: int | None, size: int, step: int = 2) -> list[tuple[Camera, float | None]]:
         """Return the cameras of a film and their times.
 
         Args:
             frames: number of cameras, spread evenly over the path and interpolated; None: those of the path.
             size: longer side of the pictures in pixels.
+            step: as for ``cameras.image_size``.
         """
         chosen = self.cameras if frames is None else resampled(self.cameras, frames)
-        width, height = image_size(Overview((0, 0, 0), (0, 0, 1), 1.0, 60.0, 0.0, aspect=self.aspect), size)
+        width, height = image_size(Overview((0, 0, 0), (0, 0, 1), 1.0, 60.0, 0.0, aspect=self.aspect), size, step)
         made = []
         for viewmat, fov, time, stretch, (across, down) in chosen:
             focal = 0.5 * height / math.tan(0.5 * fov)

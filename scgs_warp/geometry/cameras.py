@@ -240,14 +240,17 @@ def look_at(eye: Vector, target: Vector, up: Vector) -> Tensor:
     return torch.from_numpy(viewmat).float()
 
 
-def image_size(overview: Overview, size: int) -> tuple[int, int]:
-    """Return (width, height) in the training images' proportions: longer side ``size``, both even for video."""
+def image_size(overview: Overview, size: int, step: int = 2) -> tuple[int, int]:
+    """Return (width, height) in the training images' proportions: longer side ``size``, both multiples of ``step``,
+    which is 2 for video."""
     width = size if overview.aspect >= 1 else size * overview.aspect
     height = size / overview.aspect if overview.aspect >= 1 else size
-    return max(2, 2 * round(width / 2)), max(2, 2 * round(height / 2))
+    return max(step, step * round(width / step)), max(step, step * round(height / step))
 
 
-def orbit_camera(overview: Overview, azimuth: float, size: int, elevation: float | None = None) -> Camera:
+def orbit_camera(
+    overview: Overview, azimuth: float, size: int, elevation: float | None = None, step: int = 2
+) -> Camera:
     """Return a camera on the sphere around the scene's centre that looks at the centre.
 
     Args:
@@ -255,11 +258,12 @@ def orbit_camera(overview: Overview, azimuth: float, size: int, elevation: float
         azimuth: degrees, as ``Overview.azimuth``.
         size: longer side of the image in pixels.
         elevation: degrees, clamped to ``STEEPEST``. None: that of the training cameras.
+        step: as for ``image_size``.
 
     Returns:
         A camera on the CPU with square pixels and the training cameras' field of view.
     """
-    width, height = image_size(overview, size)
+    width, height = image_size(overview, size, step)
     elevation = overview.elevation if elevation is None else elevation
     tilt = math.radians(max(-STEEPEST, min(STEEPEST, elevation)))
     turn = math.radians(azimuth)
@@ -280,7 +284,9 @@ def azimuth_of(overview: Overview, eye: Vector) -> float:
     return math.degrees(math.atan2(float(offset @ ninety), float(offset @ zero))) % 360.0
 
 
-def turntable(overview: Overview, frames: int, size: int, azimuths: tuple[float, float] | None = None) -> list[Camera]:
+def turntable(
+    overview: Overview, frames: int, size: int, azimuths: tuple[float, float] | None = None, step: int = 2
+) -> list[Camera]:
     """Return the cameras of a looping film that goes around the scene.
 
     If the training cameras surround the scene, the film is one turn of equal steps that starts at the first camera. If
@@ -292,6 +298,7 @@ def turntable(overview: Overview, frames: int, size: int, azimuths: tuple[float,
         frames: number of cameras.
         size: longer side of the images in pixels; the shorter follows the training images' proportions.
         azimuths: (first, last) in degrees, which replace this path: equal steps from the first, without the last.
+        step: as for ``image_size``.
 
     Raises:
         ValueError: ``frames`` is less than 1.
@@ -307,4 +314,4 @@ def turntable(overview: Overview, frames: int, size: int, azimuths: tuple[float,
     else:
         reach = SWING_SHARE * overview.sweep / 2
         angles = [overview.azimuth + reach * math.sin(2 * math.pi * phase) for phase in phases]
-    return [orbit_camera(overview, angle, size) for angle in angles]
+    return [orbit_camera(overview, angle, size, step=step) for angle in angles]

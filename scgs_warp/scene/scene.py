@@ -242,9 +242,9 @@ class Scene:
 
         Args:
             path: a name that ends in .mp4 or .gif, or a folder for numbered PNGs.
-            options: ``frames`` (120), ``size`` (512: longer side in pixels), ``fps`` (30), ``time`` (None: the scene
-                moves; else the time at which it stands), ``show`` (``rgb``, ``depth``, ``alpha``, ``nodes``,
-                ``trajectories``).
+            options: ``frames`` (120), ``size`` (512: longer side in pixels; an .mp4 has even sides), ``fps`` (30),
+                ``time`` (None: the scene moves; else the time at which it stands), ``show`` (``rgb``, ``depth``,
+                ``alpha``, ``nodes``, ``trajectories``).
 
         Returns:
             The path.

@@ -41,7 +41,7 @@ def turntable(
         raise UserError(
             f"frames {frames}, size {size}, fps {fps:g}: give at least 1, 16 to 8192, and {video.SLOWEST} to 1000"
         )
-    path_cameras = cameras.turntable(framed(scene), frames, size)
+    path_cameras = cameras.turntable(framed(scene), frames, size, step=video.size_step(target))
     last = max(frames - 1, 1)
     views = [
         (camera.to(scene.device), index / last if time is None else time) for index, camera in enumerate(path_cameras)

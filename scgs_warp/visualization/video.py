@@ -57,6 +57,11 @@ def check_path(path: str | Path) -> Path:
     return path
 
 
+def size_step(path: str | Path) -> int:
+    """Return the number of pixels of which the sides of a film should be multiples: H.264 needs even sides."""
+    return 2 if Path(path).suffix.lower() == ".mp4" else 1
+
+
 def frame_gib(width: int, height: int | None = None) -> float:
     """Return the memory in GiB that a frame takes while it is rendered and written; without ``height`` it is square."""
     return PIXEL_BYTES * width * (height or width) / 2**30

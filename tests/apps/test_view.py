@@ -49,6 +49,17 @@ def test_turntable_moves_the_camera_round_a_standing_scene(monkeypatch, tmp_path
         assert same(frame, (FakeScene().render(camera, 0.25).rgb.numpy() * 255).round())
 
 
+@pytest.mark.parametrize(("name", "shape"), [("odd", (37, 37)), ("odd.gif", (37, 37)), ("odd.mp4", (36, 36))])
+@pytest.mark.parametrize("mode", ["turntable", "time"])
+def test_only_films_that_need_even_sides_have_them(monkeypatch, tmp_path, capsys, name, shape, mode) -> None:
+    install(monkeypatch, FakeScene())
+    more = ["--size", "37", "--frames", "2", "--frame", "cameras", "--mode", mode]
+    assert view.cli(["--run", str(tmp_path), "--output", str(tmp_path / name), *more]) == 0
+    assert f"2 frames of {shape[1]} x {shape[0]}" in capsys.readouterr().out
+    if name == "odd":
+        assert [frame.shape[:2] for frame in read_frames(tmp_path / name)] == [shape] * 2
+
+
 def test_a_time_alone_is_that_of_the_whole_film(monkeypatch, tmp_path) -> None:
     named = film(monkeypatch, tmp_path, "--mode", "turntable", "--time", "0.25")
     assert all(same(a, b) for a, b in zip(film(monkeypatch, tmp_path, "--time", "0.25"), named, strict=True))
