@@ -38,7 +38,8 @@ class Options:
     skeleton: bool = False
     """Print the parts that moved together, with their joints, and end (docs/editing.md)."""
     parts: int | None = None
-    """Number of parts to find, instead of the number that follows from the motion."""
+    """Number of parts to find, instead of the number that follows from the motion: more are found if the scene falls
+    into more pieces, fewer if the motion tells no more apart. A line then says so."""
     motion: Path | None = None
     """Motion to play on the scene's parts as keyframes: a run folder, or a glTF character (.glb, .gltf)."""
     clip: str | None = None
@@ -168,11 +169,22 @@ def open_session(options: Options, device: str) -> EditSession:
                 f"--parts {options.parts}: --script {options.script} holds its own parts; leave --parts out"
             )
         warn_of_another_scene(options.script, session)
+    if options.parts is not None:
+        note_other_count(session, options.parts)
     if options.motion is not None:
         play_motion(session, options, device)
     if options.size is not None:
         session.resize_film(options.size)
     return session
+
+
+def note_other_count(session: EditSession, count: int) -> None:
+    """Say so if --parts gives another number of parts."""
+    from scgs_warp.edit.skeleton_from_motion import other_count
+
+    said = other_count(session.skeleton, count)
+    if said is not None:
+        print(f"note: --parts {count}: {said}", file=sys.stderr)
 
 
 def warn_of_another_scene(script: Path, session: EditSession) -> None:

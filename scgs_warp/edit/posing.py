@@ -69,8 +69,8 @@ class Posing:
         """Return the parts that moved rigidly together over the trained motion, with their joints.
 
         Args:
-            count: number of parts; None: the parts of the edit's skeleton, or else of the run's, whose number follows
-                from the motion.
+            count: number of parts, more if the scene falls into more pieces, fewer if the motion tells no more apart;
+                None: the parts of the edit's skeleton, or else of the run's, whose number follows from the motion.
 
         Raises:
             UserError: the count is no whole number above 0.
@@ -83,8 +83,8 @@ class Posing:
         return self._found[count].parts
 
     def use_parts(self, count: int | None = None) -> None:
-        """Replace the edit's skeleton by one of ``count`` parts found in the motion; None: by that of the run. Handles
-        of parts are removed."""
+        """Replace the edit's skeleton by one of ``count`` parts, as for :meth:`parts`; None: by that of the run.
+        Handles of parts are removed."""
         if count is not None:
             self.parts(count)
         edit = self.edit

@@ -35,7 +35,8 @@ def find_skeleton(scene: Scene, binding: tuple[np.ndarray, np.ndarray], count: i
 
     Args:
         binding: indices and skinning weights of the control points of each Gaussian, [N, K] each.
-        count: number of parts; None: chosen from the motion.
+        count: number of parts; None: chosen from the motion. There are more where the scene falls into more pieces,
+            and fewer where the motion, or the shape of what stands still, tells no more apart (``other_count``).
     """
     patches = observe(scene, binding)
     source: Source = "motion"
@@ -45,6 +46,20 @@ def find_skeleton(scene: Scene, binding: tuple[np.ndarray, np.ndarray], count: i
     joints = find_joints(patches, labels)
     owner = _labels_of_nodes(scene, patches, labels)
     return Skeleton(tuple(_part(scene, row, joint, owner) for row, joint in enumerate(joints)), source)
+
+
+def other_count(skeleton: Skeleton, count: int) -> str | None:
+    """Say why ``find_skeleton`` has found another number of parts than ``count``; None: it has not."""
+    found = len(skeleton.parts)
+    if found == count:
+        return None
+    if found > count:
+        why = "the scene falls into that many pieces, and no part spans two"
+    elif skeleton.source == "geometry":
+        why = "what stands still is not cut into smaller pieces"
+    else:
+        why = "the motion tells no more apart"
+    return f"gives {found}: {why}"
 
 
 def moves(patches: Patches) -> bool:

@@ -16,6 +16,7 @@ from helpers.edit_scripts import SCRIPT
 from helpers.export_runs import still_scene
 from scgs_warp.apps import edit as app
 from scgs_warp.edit import Edit, EditSession
+from scgs_warp.edit.skeleton_from_motion import other_count
 from scgs_warp.formats.gaussian_files import read_gaussians
 from scgs_warp.formats.gaussian_ply import read_gaussian_ply, write_gaussian_ply
 from scgs_warp.scene.from_gaussians import open_gaussians
@@ -113,7 +114,28 @@ def test_the_skeleton_is_printed(monkeypatch, capsys):
 
 def test_a_number_of_parts_is_taken(ply, capsys):
     assert app.cli(["--ply", str(ply), "--nodes", "40", "--skeleton", "--parts", "1"]) == 0
-    assert len(capsys.readouterr().out.splitlines()) >= 2
+    said = capsys.readouterr()
+    assert len(said.out.splitlines()) >= 2 and said.err == ""
+
+
+def test_another_number_of_parts_than_asked_for_is_said_with_its_reason(ply, tmp_path, monkeypatch, capsys):
+    assert app.cli(["--ply", str(ply), "--nodes", "40", "--skeleton", "--parts", "1000"]) == 0
+    said = capsys.readouterr()
+    found = len(said.out.splitlines()) - 2  # a line says where the parts come from, and one is the table's head
+    wanted = f"note: --parts 1000: gives {found}: what stands still is not cut into smaller pieces\n"
+    assert 1 <= found < 40 and said.err == wanted
+    gaussians = read_gaussian_ply(ply).activate()
+    with torch.no_grad():
+        gaussians.means[: len(gaussians.means) // 2] += 50.0
+    write_gaussian_ply(tmp_path / "two.ply", gaussians)
+    assert app.cli(["--ply", str(tmp_path / "two.ply"), "--nodes", "40", "--skeleton", "--parts", "1"]) == 0
+    wanted = "note: --parts 1: gives 2: the scene falls into that many pieces, and no part spans two\n"
+    assert capsys.readouterr().err == wanted
+    moving = EditSession(bar_scene(nodes=20))
+    moving.use_parts(500)
+    told = other_count(moving.skeleton, 500)
+    assert told == f"gives {len(moving.skeleton.parts)}: the motion tells no more apart"
+    assert other_count(moving.skeleton, len(moving.skeleton.parts)) is None
 
 
 def test_a_motion_in_which_nothing_moves_is_named(ply, tmp_path, monkeypatch, capsys):
