@@ -301,7 +301,7 @@ def main(args: list[str] | None) -> None:
         print(f"{options.output}: {frames} frames of {camera.width} x {camera.height}")
     if options.export is not None:
         from scgs_warp.edit.filming import beyond_end
-        from scgs_warp.export.run import write_edited
+        from scgs_warp.export.still import write_edited
 
         last = max((frame.at for frame in session.edit.keyframes), default=0.0)
         at = last if options.at is None else options.at

@@ -26,7 +26,7 @@ from provenance import ROOT
 sys.path.insert(0, str(ROOT / "tests"))
 
 from helpers.export_files import gltf_arrays
-from scgs_warp.export.run import write_still
+from scgs_warp.export.still import write_still
 from scgs_warp.formats.gaussian_files import read_gaussians
 from scgs_warp.formats.gaussian_parameters import to_arrays
 from scgs_warp.gaussians import SH_C0

@@ -73,7 +73,7 @@ def export_film(editor: Host, fields: FieldReader) -> str:
 def export_ply(editor: Host, fields: FieldReader) -> str:
     """Start to write the edited Gaussians at the moment shown, as ``edit.py --export`` does."""
     from ..export.plain import pieces_of
-    from ..export.run import write_edited
+    from ..export.still import write_edited
 
     path, moment, session = _path(editor, fields, ".ply"), editor.model.moment(), _forked(editor)
 

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
@@ -17,9 +17,9 @@ from ..edit import EditSession, edit_file
 from ..edit.filming import beyond_end, note_what_is_late
 from ..edit.skeleton import Skeleton as Parts
 from ..errors import UserError
-from ..formats.gaussian_files import read_antialiased, read_gaussians, shortage_as_user_error, write_gaussians
+from ..formats.gaussian_files import read_antialiased, read_gaussians, shortage_as_user_error
 from ..formats.sog_files import META
-from ..geometry.axes import Axis, direction
+from ..geometry.axes import direction
 from ..motion.control_points import ControlPoints
 from ..motion.static_nodes import COUNT
 from ..runtime.progress import progress
@@ -30,11 +30,12 @@ from .cameras import write_cameras
 from .control_graph import write_graph
 from .glb import write_glb
 from .moving import export_fourdgs, export_tracks
+from .no_surface import explained
 from .npz import write_npz
 from .part_rig import build_rig
-from .plain import at_once, plain_scene
+from .plain import plain_scene
 from .poster import edited_poster
-from .request import FRAME_FORMATS, SEQUENCES, ExportRequest, check_request, output_suffix
+from .request import FRAME_FORMATS, SEQUENCES, ExportRequest, check_request
 from .sequence import ENDINGS, check_folder, write_sequence
 from .skeleton import (
     AnimationMoment,
@@ -48,12 +49,11 @@ from .skeleton import (
     posed_gaussians,
     select_gaussians,
 )
+from .still import FILE_UP, check_reach, clipping, write_still
 
 if TYPE_CHECKING:
     from .page import PageOptions
 
-FILE_UP: Axis = "-y"
-"""Up direction of Gaussians from files, which do not state it."""
 FRAMES, FPS = 60, 30.0
 
 
@@ -67,7 +67,8 @@ def export(request: ExportRequest, device: str = "cpu") -> str:
     if request.kind in SEQUENCES:
         check_folder(request.output)
     if request.kind == "mesh":
-        held = _export_mesh(request, device)
+        with explained(request.run, request.ply):
+            held = _export_mesh(request, device)
     elif request.still:
         held = _export_still(request, device)
     elif request.kind == "cameras":
@@ -119,72 +120,27 @@ def _export_still(request: ExportRequest, device: str) -> str:
         scene = _open(request, device)
         up, antialiased = scene.overview.up, scene.config.antialiased
         session = None if request.edit is None else _open_session(request, scene)
-        scene = plain_scene(scene if session is None else session.scene)
-        if session is not None:
-            session, at = session.drawn_with(scene), request.at or 0.0
-            gaussians = session.gaussians_at(session.scene_time(at), at)
-            when = f"{at:g} s into the edit's film{beyond_end(session, at)}"
-        elif request.time is not None:
-            gaussians, when = scene.gaussians_at(request.time), f"at time {request.time:g}"
-        else:
+        scene = scene if session is None else session.scene
+        check_reach(request.output, lambda: _at_moment(request, scene, session)[0])
+        scene = plain_scene(scene)
+        gaussians, when = _at_moment(request, scene, session)
+        if session is None and request.time is None:
             gaussians = _with_mean_colors(scene, None, even_moments(FRAMES, FPS))
     gaussians = keep_finite(gaussians)
     version = request.spz_version or 4
     clipped = write_still(request.output, gaussians, up=up, antialiased=antialiased, spz_version=version)
-    return f"{len(gaussians.means):,} Gaussians {when}{_clipping(request.output, clipped)}"
+    return f"{len(gaussians.means):,} Gaussians {when}{clipping(request.output, clipped)}"
 
 
-def write_edited(
-    path: Path,
-    session: EditSession,
-    time: float,
-    at: float | None,
-    compute: Callable[[Callable[[], Any]], Any] = at_once,
-) -> tuple[int, str]:
-    """Write a moment of an edit, fitting Gaussians in place of sharp ones, as :func:`export` does with ``--at``.
-
-    Args:
-        time, at: as for ``EditSession.gaussians_at``.
-        compute: as for ``plain_scene``; it is called once more than there.
-
-    Returns:
-        Number of Gaussians, and a note on clipped values.
-    """
-    scene = plain_scene(session.scene, compute)
-    gaussians = compute(lambda: keep_finite(session.drawn_with(scene).gaussians_at(time, at)))
-    clipped = write_still(path, gaussians, up=scene.overview.up, antialiased=scene.config.antialiased)
-    return len(gaussians.means), _clipping(path, clipped)
-
-
-def _clipping(path: Path, clipped: int) -> str:
-    return f" ({clipped:,} values clipped to what {output_suffix(path)} can hold)" if clipped else ""
-
-
-def write_still(
-    path: Path,
-    gaussians: Gaussians,
-    *,
-    up: tuple[float, float, float] = direction(FILE_UP),
-    antialiased: bool = False,
-    spz_version: Literal[3, 4] = 4,
-) -> int:
-    """Write activated Gaussians, world units, in the format of the longest suffix: .glb, or one of
-    ``gaussian_files.READERS``.
-
-    Args:
-        up: unit vector, used by .glb alone.
-        antialiased, spz_version: as for :func:`~scgs_warp.formats.gaussian_files.write_gaussians`.
-
-    Returns:
-        Number of values clipped to the range of the format.
-
-    Raises:
-        UserError: the suffix is none of these, or the file cannot be written.
-    """
-    if path.suffix.lower() != ".glb":
-        return write_gaussians(path, gaussians, antialiased=antialiased, spz_version=spz_version)
-    write_glb(path, gaussians, up)
-    return 0
+def _at_moment(request: ExportRequest, scene: Scene, session: EditSession | None) -> tuple[Gaussians, str]:
+    """Return the Gaussians of a scene at the moment of a still, and the moment in words."""
+    if session is not None:
+        session, at = session.drawn_with(scene), request.at or 0.0
+        when = f"{at:g} s into the edit's film{beyond_end(session, at)}"
+        return session.gaussians_at(session.scene_time(at), at), when
+    if request.time is not None:
+        return scene.gaussians_at(request.time), f"at time {request.time:g}"
+    return at_rest(scene), "at rest"
 
 
 def _export_moving(request: ExportRequest, device: str) -> str:
@@ -208,7 +164,8 @@ def _export_moving(request: ExportRequest, device: str) -> str:
     if request.kind in SEQUENCES:
         return _write_frames(request, scene, session, moments)
     if request.kind == "tracks":
-        return export_tracks(request.output, scene, session, moments, request.points)
+        with explained(request.run, request.ply):
+            return export_tracks(request.output, scene, session, moments, request.points)
     if request.kind == "4dgs":
         return export_fourdgs(request.output, scene, session, moments, _usable(scene))
     assert session is not None

@@ -22,6 +22,7 @@ from ..runtime.search_tree import search_tree
 from ..scene.scene import Scene
 from ..storage.files import read_bytes, write_atomically
 from .gltf import VERTICES, GltfDocument, linear_colors, upright
+from .no_surface import NoSurface
 from .skeleton import AnimationMoment, finite_rows, posed_gaussians
 
 FORMAT = "scgs-warp tracks"
@@ -108,14 +109,13 @@ def build_tracks(
         suffix: that of the file to be written, which decides on the memory.
 
     Raises:
-        UserError: no Gaussian is opaque, the motion is not finite, or memory does not suffice.
+        NoSurface: no Gaussian is opaque.
+        UserError: the motion is not finite, or memory does not suffice.
     """
     start = scene.gaussians_at(0.0)
     surface = np.flatnonzero(finite_rows(start) & (start.opacities.cpu().numpy() >= MIN_OPACITY))
     if not len(surface):
-        raise UserError(
-            f"no Gaussian is opaque to {MIN_OPACITY:g}, so that there is no surface to follow; train longer"
-        )
+        raise NoSurface(f"no Gaussian is opaque to {MIN_OPACITY:g}, so that there is no surface to follow")
     means, quats = start.means.cpu().double().numpy(), unit(start.quats.cpu().double().numpy())
     offsets = None
     if isinstance(chosen, np.ndarray):

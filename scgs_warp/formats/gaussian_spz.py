@@ -54,8 +54,20 @@ def fraction_bits(means: np.ndarray) -> int:
     reach = float(np.abs(means).max()) or 1.0
     room = math.floor(math.log2((2**23 - 1) / reach))
     if room < 0:
-        raise UserError(f"a Gaussian lies {reach:.3g} from the origin; .spz holds up to 8.3e6: make the scene smaller")
+        raise UserError(f"a Gaussian lies {reach:.3g} from the origin, and .spz holds up to 8.3e6; write a .ply")
     return max(0, min(wanted, room, MAX_FRACTION_BITS))
+
+
+def check_positions(path: str | Path, means: np.ndarray) -> int:
+    """Return the fractional bits of positions [N, 3] that are to be written.
+
+    Raises:
+        UserError: as ``fraction_bits``, and names the file.
+    """
+    try:
+        return fraction_bits(means)
+    except UserError as error:
+        raise UserError(f"{path}: {error}") from None
 
 
 def write_spz(
@@ -80,7 +92,7 @@ def write_spz(
     """
     gaussians = gaussians.plain()
     means = gaussians.means.detach().cpu().double().numpy() * (1, -1, -1)
-    bits = fraction_bits(means)
+    bits = check_positions(path, means)
     fixed = np.rint(means * 2.0**bits).astype("<i4")
     quats = torch.nn.functional.normalize(gaussians.quats.detach().cpu().double(), dim=1).numpy()
     rest = gaussians.sh_rest.detach().cpu().double().numpy()

@@ -192,7 +192,7 @@ def test_control_points_and_parts_that_would_be_ignored_are_refused(ply, tmp_pat
 
 def test_an_export_fits_sharp_gaussians(tmp_path, monkeypatch):
     fitted = []
-    monkeypatch.setattr("scgs_warp.export.run.plain_scene", lambda scene, *_: fitted.append(scene) or scene)
+    monkeypatch.setattr("scgs_warp.export.still.plain_scene", lambda scene, *_: fitted.append(scene) or scene)
     session = EditSession(bar_scene())
     monkeypatch.setattr(app, "open_session", lambda options, device: session)
     assert app.cli(["--run", "a", "--export", str(tmp_path / "x.ply")]) == 0

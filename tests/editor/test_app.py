@@ -24,7 +24,7 @@ from scgs_warp.editor.app import MAX_WAITING
 from scgs_warp.editor.state import CURVE
 from scgs_warp.export import plain
 from scgs_warp.export.page_data import unpack
-from scgs_warp.export.run import write_edited
+from scgs_warp.export.still import write_edited
 from scgs_warp.formats.gaussian_ply import write_gaussian_ply
 
 pytest.importorskip("aiohttp", reason="the package aiohttp is not installed")

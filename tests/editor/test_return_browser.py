@@ -18,7 +18,7 @@ import pytest
 from helpers.edit_scenes import bar_scene
 from helpers.editor_windows import Window, until
 from helpers.free_ports import free_port
-from scgs_warp.export.run import write_still
+from scgs_warp.export.still import write_still
 from scgs_warp.live.run_view import packed
 from scgs_warp.live.viewer import SceneView
 

@@ -12,7 +12,7 @@ import trimesh
 from helpers.export_files import cloud, gltf_arrays, ordered, picture
 from helpers.node_packages import gltf_errors, splat_transform
 from scgs_warp.edit.rotations import rotate
-from scgs_warp.export.run import write_still
+from scgs_warp.export.still import write_still
 from scgs_warp.types import Gaussians
 
 

@@ -21,8 +21,8 @@ from scgs_warp.export.mesh.binding import bind, posed
 from scgs_warp.export.mesh.files import write_mesh
 from scgs_warp.export.mesh.surface import Surface
 from scgs_warp.export.part_rig import build_rig
-from scgs_warp.export.run import write_still
 from scgs_warp.export.skeleton import at_rest, build_skeleton, even_moments
+from scgs_warp.export.still import write_still
 from scgs_warp.export.tracks import build_tracks, write_tracks
 from scgs_warp.gaussians import SH_C0
 from scgs_warp.types import Gaussians

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import pytest
@@ -11,8 +12,12 @@ from helpers.edit_scenes import bar_scene
 from helpers.export_runs import export, moving_run, save, still_scene
 from scgs_warp.apps import export as app
 from scgs_warp.config.presets import from_dict
-from scgs_warp.motion import build_motion
+from scgs_warp.edit import EditSession
+from scgs_warp.errors import UserError
+from scgs_warp.export.still import write_edited
+from scgs_warp.motion import Static, build_motion
 from scgs_warp.runtime import memory
+from scgs_warp.scene.from_gaussians import with_control_points
 from scgs_warp.scene.scene import Scene
 
 
@@ -120,3 +125,40 @@ def test_what_is_said_counts_what_is_written(run, tmp_path, capsys):
     ):
         export(*arguments)
         assert words in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(("name", "words"), [("a.csv", "surface to follow"), ("a.obj", "no surface")])
+def test_a_scene_without_surface_is_named_with_its_remedy(name, words, tmp_path, capsys):
+    like = bar_scene(nodes=8, gaussians=20)
+    with torch.no_grad():
+        like.gaussians.opacity_logits.fill_(-5.0)
+    still = Scene(like.gaussians, Static(), like.normalisation, like.config, like.overview)
+    folder, file = save(still, tmp_path / "run"), tmp_path / "faint.ply"
+    export("--run", folder, "--output", file)
+    (tmp_path / "edit.json").write_text(json.dumps({"format": "scgs-warp edit", "version": 1}))
+    sources = [(["--run", folder], "train for more steps"), (["--ply", file], "give another file")]
+    for source, remedy in sources:
+        edit = ["--edit", tmp_path / "edit.json"] if name == "a.csv" else []
+        capsys.readouterr()
+        assert app.cli([*map(str, [*source, "--output", tmp_path / name, *edit]), "--device", "cpu"]) == 2
+        said = capsys.readouterr().err
+        assert f"error: {source[1]}: no Gaussian is opaque to " in said and f"{words}; {remedy}, " in said, said
+        assert said.endswith(f"; {remedy}, or look at it with apps/view.py {source[0]} {source[1]}\n"), said
+
+
+def test_positions_beyond_spz_are_refused_before_gaussians_are_fitted(tmp_path, monkeypatch, capsys):
+    def fit(*_):
+        raise AssertionError("fitted before the check")
+
+    scene = still_scene()
+    with torch.no_grad():
+        scene.gaussians.means[0] = 1e9
+    run = save(scene, tmp_path / "run")
+    monkeypatch.setattr("scgs_warp.export.run.plain_scene", fit)
+    monkeypatch.setattr("scgs_warp.export.still.plain_scene", fit)
+    for more in ([], ["--time", "0.5"]):
+        assert app.cli(["--run", str(run), "--output", str(tmp_path / "a.spz"), *more, "--device", "cpu"]) == 2
+        said = capsys.readouterr().err
+        assert f"error: {tmp_path / 'a.spz'}: a Gaussian lies 5e+08 from the origin" in said and "write a .ply" in said
+    with pytest.raises(UserError, match=r"b\.spz: a Gaussian lies"):
+        write_edited(tmp_path / "b.spz", EditSession(with_control_points(scene, 8)), 0.0, 0.0)

@@ -22,7 +22,8 @@ from helpers.page_visits import RENDER, SIZE, psnr, until
 from helpers.touch import Touch
 from scgs_warp.export.page import write_page
 from scgs_warp.export.request import ExportRequest
-from scgs_warp.export.run import export, write_still
+from scgs_warp.export.run import export
+from scgs_warp.export.still import write_still
 from scgs_warp.geometry.cameras import orbit_camera
 from scgs_warp.motion import build_motion
 from scgs_warp.scene.from_gaussians import open_gaussians, with_control_points

@@ -13,7 +13,7 @@ from helpers.export_files import cloud, difference, matched, ordered, picture, p
 from helpers.node_packages import splat_transform
 from scgs_warp.data.points import read_points
 from scgs_warp.errors import UserError
-from scgs_warp.export.run import write_still
+from scgs_warp.export.still import write_still
 from scgs_warp.formats.gaussian_compressed_ply import CHUNK, RANGES, write_compressed_ply
 from scgs_warp.formats.gaussian_files import read_gaussians
 from scgs_warp.formats.gaussian_ply import write_gaussian_ply

@@ -17,7 +17,7 @@ from scgs_warp.data.points import read_points
 from scgs_warp.errors import UserError
 from scgs_warp.export import run as job
 from scgs_warp.export.request import ExportRequest
-from scgs_warp.export.run import write_still
+from scgs_warp.export.still import write_still
 from scgs_warp.formats import gaussian_files
 from scgs_warp.formats.gaussian_files import gaussian_points, read_antialiased, read_gaussians
 from scgs_warp.gaussians import SH_C0, GaussianParameters

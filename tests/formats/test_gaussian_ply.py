@@ -18,7 +18,7 @@ from scgs_warp.apps import export as app
 from scgs_warp.edit import EditSession
 from scgs_warp.edit.rotations import from_axis
 from scgs_warp.errors import UserError
-from scgs_warp.export.run import write_still
+from scgs_warp.export.still import write_still
 from scgs_warp.formats.gaussian_files import read_antialiased, read_gaussians
 from scgs_warp.formats.gaussian_ply import OPAQUE_LOGIT, read_gaussian_ply, write_gaussian_ply
 from scgs_warp.geometry import cameras

@@ -17,7 +17,7 @@ from PIL import Image
 from helpers.export_files import cloud, difference, matched, ordered, picture, ply_columns
 from helpers.node_packages import splat_transform
 from scgs_warp.errors import UserError
-from scgs_warp.export.run import write_still
+from scgs_warp.export.still import write_still
 from scgs_warp.formats import sog_files
 from scgs_warp.formats.gaussian_files import read_antialiased, read_gaussians
 from scgs_warp.formats.gaussian_sog import write_sog

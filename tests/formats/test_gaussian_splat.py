@@ -6,7 +6,7 @@ import numpy as np
 
 from helpers.export_files import cloud, difference, ordered, ply_columns
 from helpers.node_packages import splat_transform
-from scgs_warp.export.run import write_still
+from scgs_warp.export.still import write_still
 from scgs_warp.formats.gaussian_files import read_gaussians
 from scgs_warp.gaussians import SH_C0
 from scgs_warp.types import Gaussians

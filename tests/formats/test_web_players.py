@@ -17,7 +17,7 @@ from helpers.edit_scenes import bar_scene
 from helpers.export_files import cloud, ordered
 from helpers.node_packages import node, package
 from helpers.web_server import served
-from scgs_warp.export.run import write_still
+from scgs_warp.export.still import write_still
 from scgs_warp.formats.gaussian_files import read_gaussians
 from scgs_warp.gaussians import SH_C0
 from scgs_warp.geometry.cameras import orbit_camera

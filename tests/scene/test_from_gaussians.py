@@ -15,7 +15,8 @@ from helpers.app_runs import run_app
 from helpers.edit_scenes import bar_scene
 from helpers.export_files import cloud
 from scgs_warp.export.request import ExportRequest
-from scgs_warp.export.run import export, write_still
+from scgs_warp.export.run import export
+from scgs_warp.export.still import write_still
 from scgs_warp.geometry.axes import Axis, direction
 from scgs_warp.geometry.cameras import orbit_camera
 from scgs_warp.scene.from_gaussians import open_gaussians, with_control_points

@@ -16,6 +16,7 @@ from ...runtime import memory
 from ...runtime.cuda_graph import on_torch_stream
 from ...runtime.launch import warp_view
 from ...types import Gaussians
+from ..no_surface import NoSurface
 from .views import Surroundings, cameras_around, depth_of, points_of
 
 RESOLUTION = 256
@@ -83,12 +84,12 @@ def locate(surroundings: Surroundings, gaussians: Gaussians) -> Region:
         gaussians: posed, in normalised units.
 
     Raises:
-        UserError: nothing is opaque.
+        NoSurface: nothing is opaque.
     """
     overview = surroundings.overview
     opaque = gaussians.means[gaussians.opacities > OPAQUE].cpu().double().numpy()
     if not len(opaque):
-        raise UserError("no Gaussian of the scene is opaque, so that it has no surface; train for more steps")
+        raise NoSurface(f"no Gaussian is opaque to more than {OPAQUE:g}, so that there is no surface")
     if surroundings.closed:
         low, high = np.quantile(opaque, (STRAY_SHARE, 1.0 - STRAY_SHARE), axis=0)
         centre, radius = (low + high) / 2.0, max(float(np.linalg.norm(high - low)) / 2.0, 1e-6)
@@ -100,7 +101,7 @@ def locate(surroundings: Surroundings, gaussians: Gaussians) -> Region:
     if not surroundings.closed:
         points = points[np.linalg.norm(points - centre, axis=1) < REACH * radius]
     if not len(points):
-        raise UserError("no surface was found in the scene; train for more steps, or look at it with apps/view.py")
+        raise NoSurface("no surface was found")
     low, high = np.quantile(points, (STRAY_SHARE, 1.0 - STRAY_SHARE), axis=0)
     margin = max(MARGIN * float((high - low).max()), 1e-6)
     return Region(low - margin, high + margin)
@@ -125,7 +126,8 @@ def reconstruct(
 
     Raises:
         NotEnoughMemory: the volume does not fit into memory.
-        UserError: there is no surface, or the volume has too many voxels.
+        NoSurface: there is no surface.
+        UserError: the volume has too many voxels.
     """
     voxel = region.side / resolution
     count = int(np.prod(grid_shape(region.lower, region.upper, voxel), dtype=np.int64))
@@ -141,7 +143,7 @@ def reconstruct(
             advance()
     surface = zero_level(volume, surroundings.closed)
     if not len(surface.faces):
-        raise UserError("no surface was found in the scene; train for more steps, or look at it with apps/view.py")
+        raise NoSurface("no surface was found")
     return surface
 
 

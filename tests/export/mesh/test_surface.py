@@ -60,7 +60,7 @@ def test_nothing_opaque_is_refused():
     gaussians = ball_gaussians(count=60)
     with torch.no_grad():
         gaussians.opacity_logits.fill_(-3.0)
-    with pytest.raises(UserError, match="no Gaussian of the scene is opaque"):
+    with pytest.raises(UserError, match=r"no Gaussian is opaque to more than 0\.5"):
         made(gaussians)
 
 
