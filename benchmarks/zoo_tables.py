@@ -150,6 +150,8 @@ def depth(source: Source) -> str:
         "off": "maps are ignored (`loss.depth=0`, `flow_points=0`)",
         "true": "true maps",
         "wrong": "maps that are 4 % wrong",
+        "random": "true maps, data without points: random ones",
+        "mapped": "true maps, data without points: those of the maps",
     }
     lines = []
     for row, label in rows.items():
