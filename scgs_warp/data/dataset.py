@@ -124,6 +124,12 @@ class Dataset(Sequence[Frame]):
         """Return a data set of the given frames, in the given order."""
         return self._with([self.entries[index] for index in indices])
 
+    def without_points(self) -> Dataset:
+        """Return the data set without initial points."""
+        data = self._with(self.entries)
+        data.points = data.colors = None
+        return data
+
     @overload
     def __getitem__(self, index: int) -> Frame: ...
     @overload

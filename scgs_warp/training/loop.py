@@ -29,6 +29,7 @@ from .multi_view import StepInterrupted, check_replicas, check_share
 from .preflight import refuse_empty_chunks
 from .process_group import ProcessGroup, ProcessLost
 from .recorded_step import RecordedSteps
+from .resuming import as_begun
 from .run_folder import ReadOnlyRunFolder, RunFolder
 from .second_try import try_again
 from .state import StepResult, TrainState
@@ -104,6 +105,8 @@ def fit(
         # The first process may have to restore a checkpoint before the others read it.
         state = group.in_turn(open_state) if group is not None and resume else open_state()
         state.group = group
+        if resume:
+            data = as_begun(data, config, state.config.init_from)
         state.images = {split.split: thumbnails(split) for split in (data, test) if split is not None and len(split)}
         if config.loss.flow > state.config.loss.flow:
             folder.tell("loss.flow has no effect: frames that follow each other show too different things")

@@ -13,10 +13,22 @@ from ..data.thumbnails import thumbnails
 from ..errors import UserError
 from ..geometry.cameras import Overview, overview, places_and_directions
 from ..storage.recorded_images import differ
+from .automatic import has_initial_points
 from .scene_distance import depth_ahead
 
 SAME_CAMERAS = 0.02
 """Largest relative difference between two summaries of the same cameras, which versions may compute differently."""
+
+
+def as_begun(data: Dataset, config: TrainConfig, init_from: Any) -> Dataset:
+    """Leave out the initial points of the data if a run began without any: earlier versions did not find all of them.
+
+    Args:
+        config: settings that are asked for.
+        init_from: ``TrainConfig.init_from`` of the run.
+    """
+    began_without = init_from == "spheres" and not config.pretrain.with_points
+    return data.without_points() if began_without and has_initial_points(data, config) else data
 
 
 def check_steps(step: int, config: TrainConfig, source: str) -> None:

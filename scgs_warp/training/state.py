@@ -38,7 +38,7 @@ from .initial_models import (
 from .initial_points import initial_points
 from .process_group import ProcessGroup
 from .recall import RecallPeriod
-from .resuming import check_same_configuration, check_same_frames, check_steps
+from .resuming import as_begun, check_same_configuration, check_same_frames, check_steps
 from .scene_distance import place
 from .silhouettes import half_thickness
 from .sphere_density import thin_spheres
@@ -248,11 +248,13 @@ class TrainState:
         Raises:
             UserError: the checkpoint is missing, damaged, or made with another configuration.
         """
-        config = resolve_auto(config, data)
         tensors, metadata = checkpoint.read(folder)
         source = str(folder / checkpoint.FILE)
         check_metadata(metadata, source)
-        saved, wanted = with_newer_fields(metadata["config"], recorded=True), to_dict(config)
+        saved = with_newer_fields(metadata["config"], recorded=True)
+        data = as_begun(data, config, saved.get("init_from"))
+        config = resolve_auto(config, data)
+        wanted = to_dict(config)
         check_same_configuration({"data": saved.get("data")}, {"data": wanted["data"]}, source)
         # Settings that the data chooses differ with the frames, so the frames come before them.
         check_same_frames(metadata, data, source)

@@ -102,6 +102,30 @@ def test_resume_refuses_a_run_of_another_version(section, field, tmp_path):
         fit(config, data, output=tmp_path / "run", resume=True)
 
 
+@pytest.mark.parametrize("stop", [3, 12])
+def test_points_that_are_found_later_change_no_run(stop, tmp_path, monkeypatch):
+    """Earlier versions did not find the points of depth maps."""
+    cut_out = tiny_dataset(6)
+    data = type(cut_out)([dataclasses.replace(frame, alpha=None) for frame in cut_out], folder=Path("a"), split="train")
+    config, save = tiny_config(20), TrainState.save
+    fit(config, data, output=tmp_path / "whole")
+
+    def save_and_stop(state: TrainState, folder: Path) -> None:
+        save(state, folder)
+        if state.step == stop:
+            raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(TrainState, "save", save_and_stop)
+        with pytest.raises(KeyboardInterrupt):
+            fit(dataclasses.replace(config, checkpoint_seconds=0.0), data, output=tmp_path / "cut")
+    found = data.subset(range(len(data)))
+    found.points = torch.rand(400, 3, generator=torch.Generator().manual_seed(0)) - 0.5
+    assert resolve_auto(config, found).init_from == "points"
+    fit(config, found, output=tmp_path / "cut", resume=True)
+    assert checkpoint_bytes(tmp_path / "cut") == checkpoint_bytes(tmp_path / "whole")
+
+
 def test_what_changes_no_bit_may_differ_on_resume(tmp_path):
     fit(tiny_config(20), tiny_dataset(3), output=tmp_path / "run")
     before = checkpoint_bytes(tmp_path / "run")
