@@ -96,7 +96,8 @@ class MotionConfig:
     """Let the control points change the Gaussians' colours over time (not in the paper), as shadows and the light from
     neighbouring surfaces do. Off with ``scale_residual``, because skinning blends three values beside the motion."""
     mask: bool = False
-    """Learn a share of the motion per Gaussian (an option of the official code); hyper-coordinates work better."""
+    """Learn for each Gaussian which share of the motion it takes (an option of the official code); hyper-coordinates
+    work better."""
     time_noise: float = bounded(0.0, 0, 1e6)
     """Standard deviation of the noise on each step's time, in intervals between frames; the noise fades until
     ``network_until`` (official code, for real video)."""
@@ -141,7 +142,8 @@ class PretrainConfig:
     """Step at which spheres are no longer densified and pruned; farthest-point sampling of trajectories then reduces
     them to N_p."""
     warm_up: int = milestone(50)
-    """Step at which the network starts to move the spheres. Long at rest, only those of parts that hardly move stay."""
+    """Step at which the network starts to move the spheres. After a longer rest, only spheres of parts that hardly move
+    would be left."""
     densify_every: int = bounded(100, 1)
     """Number of steps between two rounds of densification."""
     densify_by: Literal["share", "gradient"] = newer("share", before="share")
@@ -153,10 +155,11 @@ class PretrainConfig:
     grad_threshold: float = newer(2e-4, before=2e-4, least=0)
     """Gradient with respect to the 2D mean, in normalised device coordinates, for ``densify_by`` gradient."""
     start_ratio: float = bounded(8.0, 1, 1e4)
-    """Number of spheres per control point (with ``densify_by`` share counting at least 256) at the start; spheres at
-    rest cost little."""
+    """Number of spheres per control point at the start, where ``densify_by`` share counts at least 256 control points;
+    spheres at rest cost little."""
     max_ratio: float = bounded(2.0, 1, 1e4)
-    """Once the spheres move, at most this many per control point (counted likewise): the network is asked for each."""
+    """Largest number of spheres per control point once the spheres move (control points counted as for
+    ``start_ratio``): the network is evaluated at each sphere."""
     grey: bool = newer(False, before=False)
     """Start with grey spheres (official code), not with the colours of the points."""
     opacity_rate: float = rate(0.02)
@@ -167,8 +170,9 @@ class PretrainConfig:
     arap_weight: float = bounded(1e-3, 0, 1e6)
     """Weight of ARAP on the trajectories of the spheres."""
     arap_by: Literal["auto", "track", "moment"] = newer("auto", before="track")
-    """Neighbours of ARAP: over the whole time (track, supplement), at the first time compared if they stay (moment), or
-    (auto) by track, then for cut-out subjects that are not thin a second time by moment (``training.second_try``)."""
+    """Choice of ARAP's neighbours. track: those over the whole time (supplement). moment: those at the first of the two
+    times compared, less those that part. auto: track; then, for cut-out subjects that are not thin, stage 1 is trained
+    a second time with moment (``training.second_try``)."""
     random_background: bool = True
     """Change the background in every step if the data has alpha: black cloth is then not taken for empty space."""
     silhouette: float = newer(0.5, before=0.0, least=0, most=1e6)
@@ -180,14 +184,15 @@ class PretrainConfig:
     part from farther away, and moves it instead of turning it transparent."""
     fade: Literal["auto", "always", "never"] = newer("auto", before="always")
     """Let spheres turn more transparent than ``solid_opacity``. A part whose spheres have faded is lost, but strays
-    should fade. auto: yes, unless ``silhouette`` leads spheres to a subject in separate parts, which is not thin."""
+    should fade. auto: never if the subject is in separate parts, is not thin, and ``silhouette`` is above 0; otherwise
+    always."""
     progressive: bool = False
     """Begin with the first 20 % of the frames and add 20 % every ``progressive_every`` steps."""
     progressive_every: int = milestone(500, 1)
     """Number of steps from one fifth of the frames to the next."""
     progressive_by: Literal["frame", "fifth"] = newer("frame", before="frame")
-    """How frames are added. frame: one by one at that pace, with every other step on one of the newest 20 %, and
-    spheres that begin in the first pose. fifth: 20 % at a time, all frames equally often (supplement)."""
+    """How frames are added. frame: one by one at the same pace; every other step uses one of the newest 20 %, and
+    spheres begin in the first pose. fifth: 20 % at a time; all frames are used equally often (supplement)."""
     solid_opacity: float = newer(0.1, before=0.1, least=0, most=1)
     """Opacity below which a sphere is not used to place control points or Gaussians, if there are enough others."""
     least_radius: float = newer(1.0, before=1.0, least=0, most=1e3)
@@ -204,7 +209,7 @@ class DensifyConfig:
     until: int = milestone(20_000)
     """Main step of the last round."""
     every: int = bounded(100, 1)
-    """Smallest number of steps between two rounds: fewer steps see too few views to decide by."""
+    """Smallest number of steps between two rounds: after fewer steps, too few views would decide."""
     rounds: int = bounded(132, 0)
     """Largest number of rounds in total (0: no limit): three times as many double the number of Gaussians without
     improving the images."""
@@ -225,15 +230,15 @@ class DensifyConfig:
     less than this many pixels to every sampled view (sum of blending weights, at the size of the training images). 0:
     off."""
     least_views: int = newer(2, before=1, least=1, most=1_000)
-    """Visibility pruning without alpha: also remove Gaussians that contribute ``min_contribution`` to fewer views than
-    this, if all views are sampled: they explain one photo and hide the scene from others. 1: off."""
+    """Visibility pruning without alpha, if all views are sampled: also remove Gaussians that contribute
+    ``min_contribution`` to fewer views than this. They fit a single photo and hide the scene from others. 1: off."""
     clear_distance: float = newer(0.25, before=0.0, least=0, most=1)
-    """Visibility pruning without alpha: also remove Gaussians that a view sees nearer than this share of the distance
-    at which its content begins: they become fog before the lens. 0: off."""
+    """Visibility pruning without alpha: also remove Gaussians whose distance from a camera is less than this share of
+    the distance at which the camera's content begins: they become fog before the lens. 0: off."""
     faint_share: float = newer(0.01, before=0.0, least=0, most=1)
     """Visibility pruning with alpha, at the end of densification: also remove the Gaussians that contribute least, as
-    many as have together at most this share of the contributions of all (of each the largest to a sampled view). 0:
-    off."""
+    many as together have at most this share of all contributions. The contribution of a Gaussian is its largest one to
+    a sampled view. 0: off."""
     prune_large: Literal["auto", "always", "never"] = "auto"
     """Apply max_screen and max_scale. auto: only with alpha; without it, bare walls need large Gaussians."""
     max_screen: float = bounded(0.05, 0, 1e3)
@@ -249,8 +254,8 @@ class DensifyConfig:
     nodes_until: int = milestone(12_500)
     """Main step after which no control point is cloned or pruned."""
     node_grad_threshold: float = bounded(2e-4, 0)
-    """Weighted mean gradient of the Gaussians that a control point moves above which it is cloned, in the units of
-    ``grad_threshold`` and scaled likewise."""
+    """Clone control points above this gradient: the weighted mean over the Gaussians that the control point moves, in
+    the units of ``grad_threshold`` and scaled in the same way."""
     node_impact: float = newer(1e-2, before=1e-2, least=0)
     """Prune control points whose weights, summed over all Gaussians, are less than this."""
     node_growth: float = newer(0.1, before=0.1, least=0, most=1)
@@ -277,8 +282,8 @@ class TrainConfig:
     coarse: int = milestone(3_000)
     """Number of main steps at the beginning in which models without stage 1 learn a static scene."""
     shortest: int = newer(0, before=0, least=0)
-    """Number of steps to which ``freeze``, ``coarse`` and ``densify.opacity_reset_every`` shrink at most in a shorter
-    run: Gaussians need about so many to turn transparent or opaque."""
+    """Number of steps below which a shorter run does not scale ``freeze``, ``coarse`` and
+    ``densify.opacity_reset_every``: Gaussians need about as many steps to turn transparent or opaque."""
     flow_points: int = newer(4_000, before=0, least=0, most=10_000_000)
     """Number of initial points on what moves, found by optical flow, stereo of a rig or depth maps (only with initial
     points, and without alpha). 0: none."""
@@ -305,7 +310,8 @@ class TrainConfig:
     batch: int = bounded(1, 1, 100_000)
     """Number of views per step; their gradients are averaged. Processes can share them (docs/scaling.md)."""
     half_size: int = milestone(0)
-    """Number of steps, over both stages, that use the images at half their size: coarse first, and twice as fast."""
+    """Number of steps, from the start and over both stages, that use the images at half their size: such steps are
+    twice as fast."""
     evaluate_every: int = milestone(5_000, 1)
     """Number of steps between two evaluations on a few test images, which only draw the curve."""
     checkpoint_seconds: float = bounded(60.0, 0)

@@ -16,8 +16,8 @@ class LossConfig:
     ssim: float = bounded(0.2, 0, 1)
     """Weight of D-SSIM; L1 has the rest."""
     random_background: float = newer(0.1, before=0.0, least=0, most=1)
-    """Share of the main stage's steps, evenly spaced, that are on another background if the data has alpha (not in the
-    paper): on one alone, Gaussians of its colour beside the subject change no image. 0: off."""
+    """Share of the main stage's steps, evenly spaced, that use a random background if the data has alpha (not in the
+    paper). On one background alone, Gaussians of its colour beside the subject would change no image. 0: off."""
     log_error: float = newer(0.002, before=0.0, least=0, most=1e3)
     """Weight of the logarithm of each view's mean squared error (not in the paper), which weighs views by their
     relative error, as PSNR does."""
@@ -50,7 +50,7 @@ class LossConfig:
     edges that the learnt motion bends or stretches count little. 0: all edges count fully."""
     flow: float = newer(0.0, before=0.0, least=0, most=1e6)
     """Weight of the distance between rendered and measured optical flow, as a share of the image (not in the paper). It
-    fades linearly until ``flow_until``. Where frames do not follow each other as a film's do, there is no such term."""
+    fades linearly until ``flow_until``. The term is off if the frames are not consecutive frames of a film."""
     flow_until: float = newer(0.8, before=0.8, least=0, most=1)
     """Share of the main stage until which the term applies."""
     flow_every: int = newer(2, before=2, least=1)

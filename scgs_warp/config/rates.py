@@ -31,10 +31,10 @@ class OptimConfig:
     hyper: float = rate(2.5e-3)
     """Learning rate of the hyper-coordinates."""
     shading: float = rate(2.5e-3)
-    """Learning rate of what lets brightness follow the rotation."""
+    """Learning rate of the shading."""
     correctives: float = rate(8e-4, before=2.5e-3)
-    """A step then moves a mean about as far as a step of the mean itself, at any rotation. At three times the rate,
-    bodies that spin were lost."""
+    """Learning rate of the correctives. At this rate, a step moves a mean about as far as a step of the mean itself, at
+    any rotation; at three times the rate, bodies that spin were lost."""
     network: float = rate(8e-4)
     """Learning rate of the network at the start."""
     network_end: float = rate(1.6e-6)
@@ -45,16 +45,16 @@ class OptimConfig:
     """Step from which ``network_until`` counts. motion: the first that trains the network. stage: the first of each
     stage (official code)."""
     network_scale: float = newer(0.0, before=1.0, least=0, most=1)
-    """Factor on the network's rates. 0: that of the distance at which cameras see the data's initial points, which is 1
-    unless they are close: a step of the network must not move the scene past the cameras
+    """Factor on the network's rates. 0: computed from the distance at which the cameras see the data's initial points.
+    It is 1 unless the points are close: a step of the network must not move the scene past the cameras
     (``near_bound.network_scale``)."""
     nodes: float = rate(8e-4)
     """Learning rate of the radii, weights and hyper-coordinates of the control points."""
     node_positions: float = rate(8e-5)
     """Learning rate of the rest positions of the control points."""
     nodes_decay: bool = newer(True, before=True)
-    """Let ``nodes`` decay like the network's rate; otherwise it is constant (official code). ``node_positions`` always
-    decays like it."""
+    """Let ``nodes`` decay like the network's rate; otherwise ``nodes`` is constant (official code). ``node_positions``
+    always decays like the network's rate."""
     settle: float = bounded(0.15, 0, 1)
     """Share of the main stage, at its end, over which the otherwise constant rates of the Gaussians decay to a
     twentieth."""
@@ -65,4 +65,4 @@ class OptimConfig:
     """Learning rate of the feature planes of the hexplane model."""
     frame_colors: float = newer(0.0, before=0.0, least=0, most=1)
     """Learning rate of an affine colour for each training frame, for films whose exposure or white balance changes (not
-    in the paper); 0: none. 2e-3 suits most."""
+    in the paper); 2e-3 suits most films. 0: frames have no colours."""
