@@ -65,4 +65,4 @@ class OptimConfig:
     """Learning rate of the feature planes of the hexplane model."""
     frame_colors: float = newer(0.0, before=0.0, least=0, most=1)
     """Learning rate of an affine colour for each training frame, for films whose exposure or white balance changes (not
-    in the paper); 2e-3 suits most films. 0: frames have no colours."""
+    in the paper); 2e-3 suits most films. 0: off."""

@@ -97,8 +97,9 @@ def sphere_reset_due(config: TrainConfig, done: int) -> bool:
 
 
 def gradient_threshold(config: DensifyConfig, width: int, height: int, sharpness: float = 0.0) -> float:
-    """Return the gradient threshold for this image size, normalised device coordinates. It grows as sharp splats become
-    narrower, since the gradients of their means grow likewise; otherwise there would be more of them."""
+    """Return the gradient threshold for this image size, normalised device coordinates. It grows with the sharpness:
+    sharper splats are narrower, so the gradients of their means are larger, and a constant threshold would make more
+    Gaussians."""
     return _scaled(config.grad_threshold, config, width, height, sharpness)
 
 
@@ -134,11 +135,12 @@ def density_due(state: TrainState) -> bool:
 
 
 def visible_gaussians(state: TrainState, frames: Frames) -> Tensor | None:
-    """Find the Gaussians that contribute at least ``densify.min_contribution`` pixels to one of a few sampled views, or
-    to ``densify.least_views`` of all views, and that none of them sees closer than ``densify.clear_distance``. At the
-    end of densification, leave out the faintest as well (``densify.faint_share``).
+    """Find the Gaussians that visibility pruning keeps.
 
-    The views are drawn at random, different ones each time.
+    These contribute at least ``densify.min_contribution`` pixels to one of the sampled views (to
+    ``densify.least_views`` of them if all views are sampled), and no sampled view sees them closer than
+    ``densify.clear_distance``. At the end of densification, the faintest are left out as well
+    (``densify.faint_share``). The views are drawn at random, different ones each time.
 
     Returns:
         [N] bool, the rows to keep after the present step; None if visibility pruning is not due, or if the run is too
@@ -186,7 +188,8 @@ class Steps(Protocol):
 def take_step(
     state: TrainState, frames: Frames, steps: Steps, results: list[StepResult], settle: bool = False
 ) -> Tensor | None:
-    """Measure visibility where pruning is due, then take a step. ``control_density`` is to follow if density is due.
+    """Measure visibility if pruning is due, then take a step. The caller must call ``control_density`` afterwards if
+    :func:`density_due` was true before.
 
     Args:
         steps: takes the steps of the state.
@@ -212,7 +215,8 @@ def take_step(
 
 
 def control_density(state: TrainState, size: tuple[int, int], visible: Tensor | None = None) -> str | None:
-    """Add, remove and reset what the schedule requires after the present step, which ``state.step`` does not yet count.
+    """Add, remove and reset what the schedule requires after the present step. ``state.step`` does not count this step
+    yet.
 
     Args:
         size: width and height of the step's image in pixels.

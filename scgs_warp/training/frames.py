@@ -109,7 +109,7 @@ class Frames:
         self._order: tuple[tuple[int, int], list[int]] = ((-1, 0), [])
         self.by_time = sorted(range(len(self.data)), key=lambda i: data.entries[i].time)
         self.interrupted: Callable[[], bool] = lambda: False
-        """Asked between the views of a step, which ends without effect if it is True (``multi_view``)."""
+        """Called between the views of a step; if it returns True, the step ends without effect (``multi_view``)."""
 
     def __len__(self) -> int:
         return len(self.data)
@@ -118,10 +118,10 @@ class Frames:
         """Return the index of the frame of this step's ``view``.
 
         Args:
-            progressive: draw from the first 20 % of the frames by time at first; every ``progressive_every`` steps
-                another 20 % is added, at once with ``progressive_by`` fifth. Otherwise they are added one by one, and
-                every other view is one of the newest 20 %, so that the spheres follow a moving limb before views of its
-                earlier positions make them transparent.
+            progressive: draw from the first 20 % of the frames by time at first, and add another 20 % every
+                ``progressive_every`` steps. With ``progressive_by`` fifth, these are added at once. With frame, they
+                are added one by one, and every other view is one of the newest 20 %, so that the spheres follow a
+                moving limb before views of its earlier positions make them transparent.
         """
         first, allowed, number = 0, len(self.data), view_number(step, self.config, view)
         if progressive:

@@ -62,8 +62,8 @@ def fit(
     """Train a scene; the run folder holds a resumable checkpoint at any time.
 
     Args:
-        config: the complete configuration: a ``config.preset``, possibly changed by ``config.with_steps`` and
-            ``from_dict``.
+        config: the complete configuration: the result of ``config.presets.preset``, possibly changed by ``with_steps``
+            or ``from_dict`` of that module.
         data: training frames in world units (``data.load``).
         output: run folder; created if it does not exist.
         device: ``cpu`` or ``cuda``, for all computation.
@@ -75,7 +75,7 @@ def fit(
         tensorboard: also write event files for TensorBoard to ``output``; the scene stays bit-identical.
         group: the processes that share each step's views (``process_group.join_processes``); ``config.batch`` must be a
             multiple of their number. The first process writes to ``output``; all read from it.
-        watcher: shown the state between steps whenever it asks for it; the scene stays bit-identical.
+        watcher: gets the state between steps whenever it asks for it; the scene stays bit-identical.
 
     Returns:
         the scene after the last step, in every process; its ``folder`` is the run directory.

@@ -52,8 +52,8 @@ def train(
         device: ``cpu`` or ``cuda``; ``auto`` takes a GPU if there is one.
         steps: total number of steps; every milestone scales with it.
         resume: continue the run in ``output``.
-        progress: True shows a bar, and what the data are good for; False prints nothing; a function is called with
-            (work, done, total) after each step of each work, for example ("training", 500, 24000).
+        progress: True shows a bar, and advice on the data; False prints nothing. A function is called as
+            ``progress(work, done, total)`` after each step of each work, for example ("training", 500, 24000).
         settings: fields of the configuration by their dotted names, with two underscores for a dot:
             ``motion__nodes=256``, ``data__downscale=2``, ``seed=1``. ``scgs-warp config`` lists them.
 
@@ -62,7 +62,7 @@ def train(
         holds scores and renders of the held-out views, a contact sheet and curves.
 
     Raises:
-        UserError: the data, a setting, or the run folder; one line that names it and the remedy.
+        UserError: the data, a setting or the run folder is wrong; one line names it and the remedy.
         KeyboardInterrupt: after Ctrl-C, or the stop button of a notebook; the checkpoint is saved, and ``resume=True``
             continues.
     """

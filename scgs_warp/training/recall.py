@@ -1,10 +1,10 @@
-"""Recall: Gaussians of which a view shows none are drawn back to where the cameras look.
+"""Recall: if a view shows no Gaussian, the Gaussians are drawn back to where the cameras look.
 
-Nothing else would move them: what is not drawn has no gradient. Large steps of the motion, at the start or after an
-opacity reset, can carry all of them behind the camera.
+Nothing else would move them, because a Gaussian that is not drawn has no gradient. Large steps of the motion, at the
+start or after an opacity reset, can carry all Gaussians behind the camera.
 
-On a GPU the host knows the result of a step only when it starts the second one after it, and it must wait for each step
-that may draw back. Such steps therefore form a :class:`RecallPeriod`, on every device the same.
+On a GPU, the host learns the result of a step only when it starts the second step after it, and it must wait for each
+step that may draw back Gaussians. Such steps therefore form a :class:`RecallPeriod`, the same on every device.
 """
 
 from __future__ import annotations
@@ -20,7 +20,8 @@ RECALL = 0.2
 """Weight of the distance by which Gaussians are drawn back: about as strong as the image loss draws all of them
 together."""
 KNOWN_AFTER, LASTS = 2, 50
-"""Number of steps from one whose view shows nothing to the first that may draw back, and to the first that may not."""
+"""Number of steps from a step whose view shows nothing to the first step that may draw back, and to the first step
+that no longer may."""
 LEAST_DIFFERENCE = 1e-4
 """Difference from the truth above which an empty picture should show something."""
 

@@ -5,10 +5,10 @@ step is committed (``ops.step_outcome``), and the host reads the outcome while t
 fixed capacity: a step that needs more changes nothing, nor does its successor, and both are repeated with more room.
 Steps that consist of the same operations are recorded as a CUDA graph and replayed.
 
-The result is that of ``step.training_step``, which takes the steps that cannot be taken this way: those of several
-views, of refined cameras, of frames with affine colours, that compare flow, with debug checks, with lists beyond the
-memory, or that may draw back Gaussians (``recall``). On a CPU the same operations run one by one, which
-is how they are tested.
+The results are those of ``step.training_step``, which still takes the steps that cannot be taken this way: steps with
+several views, with refined cameras, with affine colours of frames, steps that compare flow, steps with debug checks,
+steps whose lists exceed the memory, and steps that may draw back Gaussians (``recall``). On a CPU the same operations
+run one by one; the tests use this.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from .step import set_rates, training_step
 from .view import View, may_recall, prepare
 
 PAIRS_PER_GAUSSIAN = 4
-"""Ratio of the capacity to the number of Gaussians before anything is known of the pairs."""
+"""Ratio of the capacity to the number of Gaussians before the number of pairs of any step is known."""
 CAPACITY_FACTOR = 1.5
 """Ratio of a new capacity to the largest number of pairs seen: views differ in their number of pairs."""
 CAPACITY_STEP = 1 << 16
@@ -44,9 +44,9 @@ SLOT_BYTES = 8 + 64
 
 
 RETRY_AFTER = 20, 500, 500
-"""Number of steps from each failed recording of one kind of steps to the next attempt; that kind is not recorded after
-one failure more. The cause may pass: autograd's graph of an earlier step that still lives, or another program that
-compiles the same kernels."""
+"""Numbers of steps from each failed recording of one kind of steps to the next attempt. After one more failure, that
+kind is not recorded again. The cause may be temporary: autograd still holds the graph of an earlier step, or another
+program compiles the same kernels."""
 
 
 class _Step(NamedTuple):
@@ -124,7 +124,7 @@ class RecordedSteps:
         return results
 
     def release(self) -> None:
-        """Let go of the state's tensors, which are to be replaced. All steps must be known."""
+        """Let go of the state's tensors, which are to be replaced. The results of all steps must be known."""
         assert not self._pending, "a step is in flight"
         self._update, self.capacity = None, 0
 

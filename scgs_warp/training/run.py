@@ -103,7 +103,7 @@ def train_and_evaluate(
         the content of ``metrics.json``; empty in processes other than the first.
 
     Raises:
-        UserError: from the data, the configuration, the run folder or the training; or scores and pictures cannot be
+        UserError: the data, the configuration, the run folder or the training fails, or scores and pictures cannot be
             written afterwards.
         KeyboardInterrupt: after Ctrl-C, SIGTERM or the end of the terminal; the checkpoint is saved.
     """

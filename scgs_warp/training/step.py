@@ -24,7 +24,8 @@ from .view import Numbers, View, compare, prepare
 SETTLED = 0.05
 """Factor on the constant learning rates at the last step."""
 ALMOST = 0.9
-"""Least opacity of spheres that must not fade, as a share of ``solid_opacity``: a sample still prefers others."""
+"""Least opacity of spheres that must not fade, as a share of ``solid_opacity``. It is below 1, so that a sample of the
+solid spheres still leaves them out."""
 
 
 def training_step(state: TrainState, frames: Frames) -> StepResult:
@@ -96,7 +97,7 @@ def one_view(state: TrainState, frames: Frames, view: int, stats: Stats) -> Step
 
 
 def _flow(state: TrainState, prepared: View) -> FlowNumbers | None:
-    """Send the flow that the step compares to the device. Its cameras are those that are learnt, if they are."""
+    """Send the flow that the step compares to the device, with the refined cameras if cameras are refined."""
     flow, device = prepared.flow, state.device
     if flow is None:
         return None
@@ -110,7 +111,7 @@ def _flow(state: TrainState, prepared: View) -> FlowNumbers | None:
 
 
 def _depth(state: TrainState, prepared: View) -> SeenDepth | None:
-    """Send the depth that the step compares to the device. Its camera is the one that is learnt, if it is."""
+    """Send the depth that the step compares to the device, with the refined camera if cameras are refined."""
     seen, device = prepared.depth, state.device
     if seen is None:
         return None

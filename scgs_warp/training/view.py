@@ -188,7 +188,8 @@ def compare(
 
 
 def may_recall(state: TrainState) -> bool:
-    """Return whether the step may draw back Gaussians, for which the host waits. One of several views always may."""
+    """Return whether the step may draw back Gaussians; the host waits for such a step. With several views it always
+    may."""
     return state.config.batch > 1 or state.recalls.holds(state.step)
 
 
