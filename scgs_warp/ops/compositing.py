@@ -86,8 +86,8 @@ def composite(
         stats: statistics to which the backward pass adds. None: they are not collected.
         absgrad: [N, 2] buffer that the backward pass overwrites with the sum over pixels of the absolute gradients of
             ``means2d``.
-        depth_unit: if given, the last channel is depth: of its blend, divided by alpha (at least 1e-10) and by this
-            unit, the result is the expected depth. Without gradients alone.
+        depth_unit: if given, the last channel is depth, and the last channel of the image is the expected depth: the
+            blended depth divided by alpha (at least 1e-10) and by this unit. Only without gradients.
         form: kernels to run; ``auto`` takes the fastest for the device. ``plain`` is the readable reference on any
             device, ``blocks`` the portable sibling of ``cuda``.
 

@@ -15,7 +15,7 @@ from . import compositing_cuda, radix
 from .node_sums import rbf_node_sums
 
 SAMPLE = 4096
-"""Number of points at least (or all) from which the extent of candidate lists is estimated."""
+"""Smallest number of points (all, if there are fewer) from which the extent of candidate lists is estimated."""
 
 
 class NodeLists(NamedTuple):
@@ -102,11 +102,17 @@ class CandidateLists(NamedTuple):
     """Candidate nodes of every block of sixteen points, with the positions that the nodes had when they were listed."""
 
     k: int
+    """Number of neighbours for which the lists were made."""
     order: Tensor
+    """[N] int32, the points in Morton order; each sixteen in a row are a block."""
     centres: Tensor
+    """[blocks, D + 1] centre and reach of each block."""
     counts: Tensor
+    """[blocks] int32, number of candidates."""
     lists: Tensor
+    """[blocks, LIST_SIZE] int32, the candidates."""
     nodes: Tensor
+    """[M, D] positions of the nodes when the lists were made."""
 
     def fit(self, points: Tensor, nodes: Tensor, k: int) -> bool:
         width = points.shape[1] + 1

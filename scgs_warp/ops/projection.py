@@ -115,10 +115,9 @@ def project(
     """Project Gaussians to a pinhole camera's image (EWA splatting, conventions of gsplat 1.5.3).
 
     A splat ends where its alpha falls under 1/255: ``radii = ceil(sqrt(2 u covariance2d))`` per axis, where
-    ``u + sharpness u^2 = ln(255 opacity)``. A
-    Gaussian is culled, with all fields 0 and no gradient, if its depth is not between the planes, its splat is off the
-    image, both radii are at most ``radius_clip``, the opacity is under 1/255, the quaternion is zero, or a value is
-    non-finite.
+    ``u + sharpness u^2 = ln(255 opacity)``. A Gaussian is culled, with all fields 0 and no gradient, if its depth is
+    not between the planes, its splat is off the image, both radii are at most ``radius_clip``, the opacity is under
+    1/255, the quaternion is zero, or a value is non-finite.
 
     Args:
         means: [N, 3] float32, world.

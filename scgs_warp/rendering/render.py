@@ -37,7 +37,7 @@ def render(
         sh_degree: degree of the harmonics used. None: the highest one present.
         stats: statistics to which the backward pass adds. None: they are not collected.
         antialiased: Mip-Splatting's opacity compensation.
-        depth_unit: number of the Gaussians' units in a unit of the resulting depth.
+        depth_unit: length of the resulting depth's unit, in units of the Gaussians.
 
     Returns:
         Image: ``rgb`` [H, W, 3] (its planar permutation is contiguous), ``alpha`` [H, W], ``depth`` [H, W] along the
@@ -71,7 +71,7 @@ def draw(
     Args:
         background: [3], or with ``depth`` also [4].
         depth: append the depth accumulated over the pixel, in world units times alpha, as a fourth channel.
-        depth_unit: with ``depth``, append the expected depth instead, in this unit; without gradients alone.
+        depth_unit: with ``depth``, append the expected depth instead, in this unit; only without gradients.
         binned: function that lists the splats of each tile. None: ``bin_splats``.
 
     Returns:
