@@ -25,7 +25,7 @@ class GaussianParameters(nn.Module):
     """
 
     left_out = 0
-    """Number of Gaussians of the file that were not finite."""
+    """Number of non-finite Gaussians of a file that were left out when it was read."""
     NAMES = ("means", "quats", "log_scales", "opacity_logits", "sh_dc", "sh_rest", "hyper", "shading", "correctives")
 
     def __init__(
@@ -96,7 +96,7 @@ class GaussianParameters(nn.Module):
         return *shape, self.sh_dc, self.correctives, self.shading
 
     def activate(self) -> Gaussians:
-        """Return the Gaussians at rest. Activation happens here and nowhere else."""
+        """Return the Gaussians at rest, activated. Motion models activate the Gaussians that they move."""
         return Gaussians(
             self.means, self.quats, self.scales(), self.opacities(), self.sh_dc, self.sh_rest, self.sharpness
         )

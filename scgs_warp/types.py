@@ -15,8 +15,8 @@ from torch import Tensor
 
 @dataclass(frozen=True)
 class Camera:
-    """A pinhole camera in OpenCV convention: x right, y down, z forward; pixel centres at +0.5. Nothing is validated
-    until it is drawn.
+    """A pinhole camera in OpenCV convention: x right, y down, z forward; pixel centres at +0.5. The fields are checked
+    only when an image is rendered.
 
     A camera-to-world matrix ``c2w`` of OpenGL or Blender becomes ``viewmat = inv(c2w @ diag(1, -1, -1, 1))``.
     """
