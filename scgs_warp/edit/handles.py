@@ -104,7 +104,7 @@ class Handle:
     target turns it about its joint (or ``pivot``), relative to its parent and to the motion."""
 
     def __post_init__(self) -> None:
-        """Check and convert the fields; which nodes there are, the scene says.
+        """Check and convert the fields. Whether the nodes exist is checked when the edit is applied to a scene.
 
         Raises:
             UserError: naming the field.

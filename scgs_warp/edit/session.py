@@ -78,9 +78,9 @@ class EditSession(Posing):
         return other
 
     def drawn_with(self, scene: Scene) -> EditSession:
-        """Return another session with this one's control points, parts and edit that poses the Gaussians of a scene
-        with the same motion: those in place of sharp ones, which some formats hold, have other opacities, by which
-        parts and neighbours would differ."""
+        """Return a session with this one's control points, parts and edit that poses the Gaussians of another scene of
+        the same motion. Exports use it for the plain Gaussians that stand for sharp ones: these have other opacities,
+        which would lead to other parts and neighbours."""
         other = self.fork()
         other.engine, other.scene = self.engine.drawn_with(scene), scene
         return other
@@ -386,8 +386,8 @@ class EditSession(Posing):
         write_atomically(Path(path), edit_file.to_json(self.edit, self.engine).encode())
 
     def load(self, path: str | Path) -> None:
-        """Replace the edit with the one in a file, as a step that can be undone. A file that names parts but holds no
-        skeleton means those of the present one.
+        """Replace the edit with the one in a file, as a step that can be undone. If the file names parts but holds no
+        skeleton, the names refer to the present skeleton.
 
         Raises:
             UserError: the file is missing, or a field is wrong; the edit stays unchanged.
