@@ -71,15 +71,15 @@ class Step(Options):
 
 @dataclass(frozen=True)
 class Edit(Options):
-    """Measure a drag of a handle in the editor up to the new picture: solve, skin, render, encode."""
+    """Measure a drag of a handle in the editor: to the pose that the page draws, and to a picture from the server."""
 
     size: str = "512"
-    """Longer side of the picture in pixels, or WIDTHxHEIGHT; the editor shows at most 512 while something moves."""
+    """Longer side of the picture in pixels, or WIDTHxHEIGHT."""
 
 
 @dataclass(frozen=True)
 class Pull(Edit):
-    """Measure a pull of a part in the editor up to the new picture: joints, solve, skin, render, encode."""
+    """Measure a pull of a part in the editor: to the pose that the page draws, and to a picture from the server."""
 
 
 @dataclass(frozen=True)

@@ -42,20 +42,20 @@ class Options:
     """Largest number of frames to pick: the sharpest, spread over time and motion. By default 150 of a video and all of
     a folder. For a rig, number of instants, 150 at most by default."""
     start: float | None = None
-    """Second of the video to begin at; for a rig, counted from the moment at which all cameras record."""
+    """Second of the video to begin at; for a rig, counted from the first moment at which all cameras record."""
     end: float | None = None
-    """Second of the video to end at, counted likewise."""
+    """Second of the video to end at, counted in the same way."""
     size: int = 1280
     """Longer side of the images in pixels; smaller ones are not enlarged."""
     masks: str = "auto"
     """Masks of image regions to ignore when finding the cameras. auto: moving regions are detected; none: nothing is
     ignored; otherwise a folder or video of masks, black where something moves."""
     keep_static: Literal["on", "off"] = "on"
-    """off: only what the given masks mark as moving, cut out by alpha, for a scene of the mover alone."""
+    """off: keep only what the given masks mark as moving, cut out by alpha, for a scene of the mover alone."""
     keep_moving: Literal["on", "off"] = "on"
-    """off: only what stands still, for a scene of the background alone; training ignores what the masks mark."""
+    """off: keep only what stands still, for a scene of the background alone; training ignores what the masks mark."""
     matching: Literal["auto", "sequential", "exhaustive"] = "auto"
-    """Frames to compare. sequential: neighbours in time; exhaustive: each with each; auto: depends on their number."""
+    """Pairs of frames to match. sequential: neighbours in time; exhaustive: all pairs; auto: by their number."""
     camera_model: Literal["SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE"] = (
         "SIMPLE_RADIAL"
     )
@@ -66,7 +66,7 @@ class Options:
     features: int = 4096
     """Largest number of features per frame."""
     least: float = 0.5
-    """Smallest share of the frames whose cameras must be found; with fewer the command fails and says what to do."""
+    """Smallest share of the frames whose cameras must be found; below it, the command fails and says what to do."""
     seed: int = 0
     """Random seed; the same video and seed give the same frames and cameras."""
     device: Device = "auto"

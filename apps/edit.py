@@ -27,7 +27,7 @@ class Options:
     up: Axis | None = None
     """Axis of --ply's file that points up; -y by default, as in reconstructions from photographs."""
     script: Path | None = None
-    """Edit to load, as JSON (docs/editing.md). Without an output, the editor opens with it."""
+    """Edit to load, as JSON (docs/editing.md). Without --output and --export, the editor opens with this edit."""
     output: Path | None = None
     """Film to write of the script's edit: a name that ends in .mp4 or .gif, or a folder for numbered PNGs."""
     export: Path | None = None
@@ -38,14 +38,14 @@ class Options:
     skeleton: bool = False
     """Print the parts that moved together, with their joints, and end (docs/editing.md)."""
     parts: int | None = None
-    """Number of parts to find, instead of the number that follows from the motion: more are found if the scene falls
-    into more pieces, fewer if the motion tells no more apart. A line then says so."""
+    """Number of parts to find, instead of the number that follows from the motion. There are more if the scene falls
+    into more pieces, and fewer if the motion does not tell so many apart. A line then says so."""
     motion: Path | None = None
     """Motion to play on the scene's parts as keyframes: a run folder, or a glTF character (.glb, .gltf)."""
     clip: str | None = None
     """Name of the animation of --motion; the first one that moves by default."""
     match: Path | None = None
-    """JSON object that names, for parts of the scene, those of --motion; by default those of the same name."""
+    """JSON object that maps parts of the scene to parts of --motion; by default, parts of the same name match."""
     nodes: int | None = None
     """Number of control points to make for a scene without motion; 512 by default."""
     size: int | None = None

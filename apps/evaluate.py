@@ -31,13 +31,13 @@ class Options:
     data: Path | None = None
     """Folder of the data set, if it has moved since training."""
     background: Literal["black", "white"] | None = None
-    """Colour behind a subject that is cut out; by default that of the training images. Another one shows what training
-    left beside the subject; its files go to RUN/evaluation/SPLIT-COLOUR."""
+    """Colour behind a subject that is cut out; by default that of the training images. Another colour shows what
+    training left beside the subject; its files go to RUN/evaluation/SPLIT-COLOUR."""
     lpips_weights: Path | None = None
     """File with VGG16 and LPIPS weights; without it LPIPS is not measured."""
     fit_color: bool = False
     """Also score each image with the affine colour (exposure, white balance) that fits it best. A run with
-    optim.frame_colors is always scored so, and with the colours of the training frames before and after."""
+    optim.frame_colors always gets this score, and one with the colours of the training frames before and after."""
     json: Path | None = None
     """File for the metrics; by default metrics.json in RUN/evaluation/SPLIT, with --also in SPLIT-mean. With it, a run
     that cannot be written is scored without renders."""

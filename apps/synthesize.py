@@ -37,11 +37,11 @@ class FilmOptions:
     crf: int = 20
     """Compression of a film: x264's constant rate factor, 0 (lossless) to 51; phones are near 23."""
     arc: float = 100.0
-    """Angle in degrees about the subject across which the cameras of a rig stand, or a walk with the phone leads."""
+    """Arc around the subject, in degrees, along which the cameras of a rig stand or the phone walks."""
     offsets: float = 0.0
     """Largest difference, in seconds, between the moments at which two cameras of a rig begin."""
     sound: bool = True
-    """Record claps in the room, by which the cameras of a rig can be synchronised."""
+    """Record claps in the room, which allow capture.py to synchronise the cameras of a rig."""
     maps: bool = False
     """Also write the depth, the flow to the next frame and a mask of the subject for every frame of a film. The data
     set of a phone's film then names the depth maps."""

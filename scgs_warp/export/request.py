@@ -89,15 +89,14 @@ class ExportRequest:
     surface points, in .npz, .csv or .glb. 4dgs: Gaussians in linear segments, for players of that format. mesh: the
     surface as triangles, in .obj, .stl, .ply or .glb (docs/mesh.md). By default the output's suffix decides."""
     time: float | None = None
-    """Instant of a still, from 0 to 1; without it Gaussians are at rest, before the motion, and a mesh is that of time
-    0."""
+    """Instant of a still, from 0 to 1. Without it, Gaussians are at rest, before the motion; a mesh shows time 0."""
     sequence: bool = False
     """The moving mesh, as one animated .glb whose triangles stay the same."""
     faces: int | None = None
     """Largest number of a mesh's triangles; 100,000 by default."""
     resolution: int | None = None
-    """Number of steps into which the longest side of a mesh is divided; 256 by default. More show finer details, and
-    take more time and memory."""
+    """Number of steps into which the longest side of a mesh is divided; 256 by default. More steps show finer details
+    and take more time and memory."""
     edit: Path | None = None
     """Edit (docs/editing.md) to apply to the scene."""
     at: float | None = None
@@ -116,11 +115,11 @@ class ExportRequest:
     url: str = ""
     """Address at which a page will be published, for links to it: a picture (.jpg) is then written beside the page."""
     points: str | None = None
-    """Of tracks: a number of points, spread over the surface, or a .csv of points at time 0 (x,y,z) to follow. All
-    Gaussians of the surface by default."""
+    """For tracks: a number of points, spread over the surface, or a .csv of points at time 0 (x,y,z) to follow. By
+    default, all Gaussians of the surface."""
     skeleton: Literal["control-points", "parts"] = "control-points"
-    """Joints of a moving glb: the control points, which hold the motion exactly, or the parts found in it, a rig of a
-    dozen named joints that comes close to it."""
+    """Joints of a moving glb. control-points: the control points, which hold the motion exactly; parts: the parts found
+    in the motion, a rig of a dozen named joints that comes close to it."""
     title: str = ""
     """Title of the page; the run's name by default."""
     max_mib: float | None = None
