@@ -43,7 +43,8 @@ unknown."""
 UNSTEADY = 0.08
 """Relative change of brightness between neighbouring frames that indicates a change of exposure."""
 MOSTLY_BEHIND = 0.2
-"""Share of the points before the cameras, over all pairs of both, below which the cameras look away from them."""
+"""Share of the (camera, point) pairs whose point lies before the camera; below it, the cameras look away from the
+points."""
 WIDE_ARC = 0.02
 """Smallest eigenvalue of the mean of I - d d^T over the optical axes d from which the place where they meet is known;
 it corresponds to an arc of about 20 degrees."""

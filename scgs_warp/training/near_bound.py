@@ -1,9 +1,9 @@
-"""How close a scene is to its cameras: the distance before every lens within which a capture shows nothing, and what
-it means for the rates of the network.
+"""How close a scene is to its cameras: the distance from the lens within which no view shows content, and what this
+distance means for the rates of the network.
 
 A Gaussian close to a lens covers the whole picture of one view, and no other view contradicts it. Densification
-therefore fills the space before isolated cameras with fog, which hides the scene from views that were held out nearby.
-But a camera has moved through that space, and its lens was in focus beyond it.
+therefore fills the space before isolated cameras with fog, which hides the scene from held-out views nearby. But that
+space is known to be empty: the camera has moved through it, and its lens was in focus beyond it.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ NEAREST_POINTS = 0.01
 NEAREST_CAMERAS = 0.05
 """Share of the cameras that may be nearer to the content than the bound assumes."""
 INSIDE = 0.1
-"""Distance to the content as a share of that to the centre, at least, for cameras without points: a camera may stand in
-the region that all cameras see."""
+"""Least distance to the content, as a share of the distance to the centre, where there are no points: a camera may
+stand inside the region that all cameras see."""
 
 
 USUAL_DISTANCE = 2.0

@@ -31,8 +31,8 @@ class Movers(NamedTuple):
     seen: InstantPoints
     """Points of one instant; none if nothing moves or no depth is found."""
     keep: Tensor
-    """[P] bool: the sparse points to keep. Those on what moves before standing cameras are of any instant, and are
-    replaced."""
+    """[P] bool, True for sparse points to keep. Of standing cameras, those on what moves are replaced, because they may
+    show any instant."""
     motion: SeenMotion | None = None
     """What stereo or depth maps show of the motion."""
     stereo: StereoDepths | None = None
@@ -48,7 +48,7 @@ def points_on_movers(
         most: largest number of points.
         count: number of all initial points. Flow gives only as many as the sparse points leave.
         known: [P, 3] sparse points of the data, normalised.
-        seed: of the choice among points of stereo.
+        seed: seed of the choice among points of stereo.
     """
     views = [normalisation.apply_camera(camera) for camera in data.cameras]
     keep, found, motion = torch.ones(len(known), dtype=torch.bool), None, None

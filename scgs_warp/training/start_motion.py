@@ -1,9 +1,10 @@
 """Motion of what moves, learnt from its points at several moments before the first step.
 
-The photometric loss moves Gaussians only as far as they overlap with what they show. An arm that waves or a leg that
-walks has left them after a few frames, and fades instead. Clouds of points, by stereo or from depth maps, show where it
-is at each moment. The motion carries the points of one moment to the clouds of the others: to their tracks where there
-are any, and to nearest points of like colour. Neighbours keep their distances, and what stands still stays.
+The photometric loss moves a Gaussian only while the Gaussian overlaps with the surface that it shows. After a few
+frames, a waving arm or a walking leg no longer overlaps with its Gaussians, and fades instead. Clouds of points, by
+stereo or from depth maps, show where the limb is at each moment. The motion learns to carry the points of one moment to
+the clouds of the others: along tracks where there are any, and to the nearest points of similar colour. Neighbours keep
+their distances, and what stands still stays.
 """
 
 from __future__ import annotations
@@ -34,7 +35,7 @@ POINTS, RESTING = 1500, 600
 RATE, RATE_END = 1e-3, 1e-4
 """Learning rate of the network at the first and the last step."""
 COLOR = 0.7
-"""Distance for which a difference of colour of 1 counts, in sizes of the mover."""
+"""Distance that equals a difference of colour of 1 in the search for nearest points, in sizes of the mover."""
 FAR = 0.5
 """Distance, in sizes of the mover, beyond which pairs of points hardly pull."""
 HIDDEN = 0.5
