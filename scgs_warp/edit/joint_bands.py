@@ -1,8 +1,8 @@
-"""Bands of skin at joints, which turn half with each of two parts and are no parts of their own.
+"""Bands of skin at joints, which turn half with each of two parts and are not parts themselves.
 
-If a joint bends far, the skin around it is wide enough to look like a part between two others. It is no larger than
-either, and turns about the same point as they turn against each other, by a share of the same angle. A bone between two
-others has a joint at either end instead.
+If a joint bends far, the skin around it is wide enough to look like a part between two others. Such a band is no larger
+than either part. It turns about the same point about which the two parts turn against each other, by a share of the
+same angle. A bone between two others has a joint at either end instead.
 """
 
 from __future__ import annotations

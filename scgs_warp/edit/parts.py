@@ -3,15 +3,15 @@
 Patches merge in three stages. First those whose union moves most rigidly (Ward's criterion), pairwise in rounds, down
 to a few dozen parts. Then patches change to a neighbouring part whose motion explains theirs better, so that early
 mistakes do not last. Last, neighbouring parts merge in the order of the angle by which they turn against each other,
-until every pair turns by more than the least angle of a joint. Parts of very few patches join before, if possible one
-of more, whose motion explains theirs best: they show where they go, but hardly how they turn. Bands of skin at joints
-(``joint_bands``) go to the parts beside them, and parts that the motion does not tell apart merge (``shared_motion``).
-An angle, other than a distance, neither favours large parts nor splits a body whose surface drifts slowly, and so the
-number of parts follows from the motion.
+until every pair turns by more than the least angle of a joint. Before that, a part of very few patches joins the
+neighbour (if possible a larger one) whose motion explains it best: such a part shows where it goes, but hardly how it
+turns. Bands of skin at joints (``joint_bands``) go to the parts beside them, and parts that the motion does not tell
+apart merge (``shared_motion``). The criterion is an angle, because a distance would favour large parts and split bodies
+whose surface drifts slowly. The number of parts therefore follows from the motion.
 
 Bodies bend where they are narrow. A boundary that is short for its parts (``_widths``) therefore counts as a joint at a
-smaller angle, and one that is long needs better evidence: where a surface looks the same in all places, its trained
-motion slides over it, and the borders of what slides run anywhere.
+smaller angle, and a long boundary needs better evidence: where a surface looks the same everywhere, its trained motion
+slides along it, and the borders of the sliding regions may lie anywhere.
 """
 
 from __future__ import annotations
@@ -32,10 +32,10 @@ LEAST_TURN = math.radians(15.0)
 """Largest angle by which two neighbouring parts may turn against each other and still be one part, if their boundary is
 not narrow."""
 MOST_DOUBTED = math.radians(45.0)
-"""Largest such angle between parts that the motion may not tell apart: more is no error of the motion. A wide
+"""Largest such angle between parts that may merge by a shared motion: a larger angle is no error of the motion. A wide
 boundary raises it."""
 USUAL_WIDTH = 2.0
-"""Width of a boundary between narrow and wide ones: around a limb, it is that of a part 0.8 times as long as thick."""
+"""Width that separates narrow from wide boundaries. Around a limb, a part 0.8 times as long as thick has this width."""
 NARROW_TURN = 0.7
 """Share of ``LEAST_TURN`` that counts where a boundary has at most this share of the usual width; in between, the angle
 grows with the width."""
@@ -44,7 +44,7 @@ MOST_DOUBT = 2.5
 FIRST_PARTS = 90
 """Number of parts at which merging by angle begins."""
 BOUNDARY_COST = 1.7e-3
-"""Distance, relative to the scene's size, by which a patch may be off before a boundary edge is cheaper."""
+"""Error of a patch's motion, relative to the scene's size, that costs as much as one more boundary edge."""
 MIN_PATCHES, MIN_SHARE = 3, 0.01
 """Number of patches, and share of all patches, below which a part joins a neighbour: the skin between two parts moves
 half with each."""

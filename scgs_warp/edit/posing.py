@@ -69,7 +69,7 @@ class Posing:
         """Return the parts that moved rigidly together over the trained motion, with their joints.
 
         Args:
-            count: number of parts, more if the scene falls into more pieces, fewer if the motion tells no more apart;
+            count: number of parts; more if the scene falls into more pieces, fewer if the motion tells fewer apart.
                 None: the parts of the edit's skeleton, or else of the run's, whose number follows from the motion.
 
         Raises:
@@ -110,8 +110,8 @@ class Posing:
         self._restructure(self.skeleton.renamed(old, new), {old: new})
 
     def merge_parts(self, first: str, second: str) -> None:
-        """Unite two neighbouring parts under the first one's name. The whole turns as the part did on which the other
-        one hung (of two that hang on the same part, as the first one); a handle of the other one is removed."""
+        """Unite two neighbouring parts under the first one's name. The united part turns as the one nearer to the root
+        did (as the first one, if both hang on the same part); a handle of the other one is removed."""
         below = self.skeleton.part(first).parent == second
         self._restructure(
             self.skeleton.merged(first, second), {first: None, second: first} if below else {second: None}

@@ -1,10 +1,10 @@
 """Neighbouring parts whose motion is not known well enough to tell them apart.
 
 A part that is narrow, or nearly round, hardly shows how it turns: errors of its trained motion then look like turns of
-some 30 degrees. Such a turn is taken for no joint if one motion explains both parts nearly as well as their own motions
-do, and nearly as well as the motions of other parts explain theirs. Errors of neighbouring points are alike, so that
-they do not average out, however many points a part has. How nearly depends on the boundary between both parts: a long
-one is more likely a border of errors than a joint.
+some 30 degrees. Such a turn does not count as a joint if one common motion explains both parts nearly as well as their
+own motions do, and nearly as well as the motions of other parts explain theirs. (Errors of neighbouring points are
+similar, so they do not average out, however many points a part has.) The limits are wider for a long boundary between
+the two parts, which is more likely a border of errors than a joint.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ def find_shared(
     doubt: np.ndarray,
     fit: Callable[[Moments, np.ndarray], tuple[Moments, Motions]],
 ) -> int | None:
-    """Return the row of ``pairs`` whose parts share one motion, that with the least distance for its doubt; None if
-    there is none.
+    """Return the row of ``pairs`` whose parts share one motion; of several, the one with the least distance divided by
+    its doubt. None if there is none.
 
     Distances are root mean squares over points and time.
 

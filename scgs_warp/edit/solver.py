@@ -45,7 +45,7 @@ FINAL_ITERATIONS = 60
 FREE_ITERATIONS = 200
 """Replaces ``FINAL_ITERATIONS`` if a group turns freely, because a whole limb then swings into place."""
 LIMITED_PACE = 2
-"""Factor on all numbers of iterations with a limit on lengths, with which each of them gets less far."""
+"""Factor on all numbers of iterations with a limit on lengths, because each of them then makes less progress."""
 TURN_ITERATIONS = 8
 TOLERANCE = 1e-4
 """Convergence threshold in edge lengths: iterations stop when no node moves further in one iteration."""
