@@ -1,5 +1,5 @@
 """Black bars that editing programs and players put beside a film of other proportions. They are no part of the scene:
-trained, they would become black walls that go along with the camera."""
+training would turn them into black walls that move along with the camera."""
 
 from __future__ import annotations
 

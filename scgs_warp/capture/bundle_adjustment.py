@@ -1,10 +1,10 @@
-"""Robust bundle adjustment: what moved, and what was matched wrongly, hardly pulls cameras.
+"""Robust bundle adjustment: moving objects and wrong matches hardly shift the cameras.
 
-COLMAP's mapper sums squared errors of all observations that it accepts. Where a mover fills a good part of a frame and
-goes along its epipolar lines, the mapper accepts its features, and they pull the camera off. A Cauchy loss lets an
-observation pull less the worse it fits. The result is taken only if it moves some cameras far more than the cameras
-beside them: where it changes all alike, nothing tells that the mapper's cameras were worse, and a film of a hand scored
-higher with them.
+COLMAP's mapper sums squared errors of all observations that it accepts. If a mover fills a good part of a frame and
+moves along its epipolar lines, the mapper accepts the mover's features, and these shift the camera. A Cauchy loss
+limits the influence of observations that fit badly. The result is used only if it moves some cameras far more than
+their neighbours. If it moves all cameras alike, nothing shows that the mapper's cameras were worse, and a film of a
+hand scored higher with the mapper's cameras.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
-"""Whether the files of a model in COLMAP's binary format are complete. pycolmap reads on behind the end of a file: for
-minutes, if what it takes for a number of entries is large."""
+"""Check that the files of a model in COLMAP's binary format are complete. pycolmap reads past the end of a truncated
+file, for minutes if it takes a large number for the number of entries."""
 
 from __future__ import annotations
 

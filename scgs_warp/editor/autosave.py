@@ -1,5 +1,5 @@
-"""Keeping of an edit, and of what is chosen, without being asked: saved after every change, restored when the editor
-starts again."""
+"""Automatic saving of an edit and of the selection: after every change. Both are restored when the editor starts
+again."""
 
 from __future__ import annotations
 

@@ -1,7 +1,8 @@
 """Moving Gaussians as ``.4dgs``, the container of https://4dgs.dev (Avala AI, Apache-2.0), version 1.
 
-Of its two temporal models ``keyframe-delta`` is written: the whole state every ``KEYFRAME_EVERY`` steps, and between
-these the Gaussians alone whose linear motion no longer holds. A reader finds any instant by the index at the end.
+The format has two temporal models, of which ``keyframe-delta`` is written: the whole state every ``KEYFRAME_EVERY``
+steps, and between these only the Gaussians whose linear motion no longer holds. A reader finds any instant by the index
+at the end.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
-"""Scenes that have no surface: what finds it out gives the reason, and what opened the scene its source and the
-remedy."""
+"""Errors for scenes that have no surface: the code that notices it gives the reason, and the code that opened the
+scene adds its source and the remedy."""
 
 from __future__ import annotations
 

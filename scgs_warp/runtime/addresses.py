@@ -1,9 +1,8 @@
 """Limit of a process's addresses (``ulimit -v``, batch systems): what it leaves, and what may begin in that.
 
 A large allocation that fails raises an error. When the last few megabytes are gone, however, a new thread of Python may
-die before it reports that it runs, while its starter waits for it forever, libraries end
-the process, and so does the system when the stack cannot grow. Programs, threads and kernels therefore begin only where
-there is room for them.
+die before it reports that it runs, and its starter waits for it forever; libraries end the process, and so does the
+system when the stack cannot grow. Programs, threads and kernels therefore begin only where there is room for them.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Agreement of given cameras with the images: how far matched features are from the epipolar lines of the poses.
 
-Features are matched between frames, and a fundamental matrix that fits most of the matches, whatever the poses say,
-selects those on what stands still. Their distance from the lines that the poses give is an error of the poses: the
-matrix that was fitted leaves a fraction of a pixel.
+Features are matched between frames. A fundamental matrix that fits most of the matches, independently of the poses,
+selects the matches on what stands still. Their distance from the epipolar lines of the poses is an error of the poses,
+because the fitted matrix leaves only a fraction of a pixel.
 """
 
 from __future__ import annotations

@@ -1,9 +1,9 @@
 """Adjustment of a rig's cameras by dense matches of their still pictures.
 
-Cameras that stand far apart share few features, which leave them several pixels off where there are none. But these
-cameras tell stereo where to look, and it finds nearly every pixel of a picture in the next one, along epipolar lines.
-Flow between the picture and the other one, warped accordingly, then corrects the match across these lines as well. The
-matches are spread over the whole pictures, and all cameras are adjusted to them; better cameras give better matches.
+Cameras that stand far apart share few features, so their poses are several pixels off where there are no features. The
+poses are good enough for stereo, which finds nearly every pixel of a picture in the next one, along epipolar lines.
+Flow between the picture and the other one, warped by these matches, then corrects the matches across these lines as
+well. The matches cover the whole pictures, and all cameras are adjusted to them; better cameras give better matches.
 """
 
 from __future__ import annotations

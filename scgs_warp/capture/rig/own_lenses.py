@@ -1,4 +1,5 @@
-"""Lenses of a rig's cameras that record pictures of one size: phones of several makes do, with other fields of view."""
+"""Lenses of a rig whose cameras record pictures of one size but may have different lenses, as phones of several makes
+do."""
 
 from __future__ import annotations
 
