@@ -11,6 +11,7 @@ from ..ops.binning import bin_splats
 from ..ops.compositing import composite, demand
 from ..ops.harmonics import MAX_DEGREE, whole_harmonics
 from ..ops.projection import project
+from ..ops.shapes import given_number, given_whole
 from ..runtime.caller_settings import unaffected
 from ..types import Camera, Splats
 from .render import centre_of, expected_depth
@@ -99,6 +100,8 @@ def rasterization(
         ValueError: a shape, dtype or choice is wrong; the message names the argument.
         NotImplementedError: an argument asks for a feature that does not exist here; the message names it.
     """
+    width, height = given_whole("width", width), given_whole("height", height)
+    sh_degree = None if sh_degree is None else given_whole("sh_degree", sh_degree)
     _refuse(
         distributed=distributed,
         camera_model=camera_model != "pinhole",
@@ -117,19 +120,17 @@ def rasterization(
         raise ValueError(f"render_mode must be one of {', '.join(RENDER_MODES)}, got {render_mode!r}")
     if rasterize_mode not in ("classic", "antialiased"):
         raise ValueError(f"rasterize_mode must be classic or antialiased, got {rasterize_mode!r}")
+    planes = {"near_plane": near_plane, "far_plane": far_plane, "radius_clip": radius_clip, "eps2d": eps2d}
+    settings = {name: given_number(name, value) for name, value in planes.items()}
     floats = {"means": means, "quats": quats, "scales": scales, "opacities": opacities, "colors": colors}
-    _check_dtypes(**floats, viewmats=viewmats, Ks=Ks, **({} if backgrounds is None else {"backgrounds": backgrounds}))
+    _check_tensors(**floats, viewmats=viewmats, Ks=Ks, **({} if backgrounds is None else {"backgrounds": backgrounds}))
     _check_shapes(means, colors, viewmats, Ks, backgrounds, sh_degree)
     cameras = [Camera(viewmat, K, width, height) for viewmat, K in zip(viewmats, Ks)]
-    settings = {
-        "near_plane": near_plane,
-        "far_plane": far_plane,
-        "radius_clip": radius_clip,
-        "eps2d": eps2d,
-        "antialiased": rasterize_mode == "antialiased",
-    }
-    geometry = means, quats, scales, opacities
-    splats = [project(*geometry, camera.viewmat, camera.K, width, height, **settings) for camera in cameras]
+    geometry, smooth = (means, quats, scales, opacities), rasterize_mode == "antialiased"
+    splats = [
+        project(*geometry, camera.viewmat, camera.K, width, height, antialiased=smooth, **settings)
+        for camera in cameras
+    ]
     meta = _meta(splats, absgrad)
 
     renders, alphas = [], []
@@ -196,12 +197,18 @@ def _refuse(**unsupported: bool) -> None:
             raise NotImplementedError(f"{name}: scgs_warp does not do this; see scgs_warp.rasterization")
 
 
-def _check_dtypes(**tensors: Tensor) -> None:
+def _check_tensors(**tensors: Tensor) -> None:
     for name, tensor in tensors.items():
         if not isinstance(tensor, Tensor):
             raise ValueError(f"{name} must be a torch tensor, got {type(tensor).__name__}; use torch.as_tensor")
         if tensor.dtype != torch.float32:
             raise ValueError(f"{name} must be float32, got {tensor.dtype}")
+        if tensor.layout != torch.strided:
+            raise ValueError(f"{name} must be dense, got {tensor.layout}; use to_dense")
+        if tensor.device != tensors["means"].device:
+            raise ValueError(
+                f"{name} is on {tensor.device}, means on {tensors['means'].device}; move them to one device"
+            )
 
 
 def _check_shapes(
