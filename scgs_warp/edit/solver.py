@@ -130,6 +130,10 @@ class ArapSolver:
         self._degree = np.asarray(graph.matrix.sum(1)).reshape(-1)
         self._systems: OrderedDict[bytes, _System] = OrderedDict()
 
+    def __getstate__(self) -> dict[str, Any]:
+        """Leave out the factorisations, which cannot be copied and are made anew."""
+        return {**self.__dict__, "_systems": OrderedDict()}
+
     def _system(self, anchors: Anchors) -> _System:
         key = anchors.hard.tobytes() + anchors.turned.tobytes() + anchors.soft.tobytes()
         system = self._systems.get(key)

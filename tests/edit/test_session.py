@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import copy
 import dataclasses
 import math
+import pickle
 from typing import Any
 
 import numpy as np
@@ -51,6 +53,15 @@ def test_no_edit_has_the_scenes_bits(shaded):
     session.add_keyframe(1.0)
     assert same(session.gaussians_at(0.5, 0.7), scene.gaussians_at(0.5)), "handles that stay are no edit"
     assert same(session.render(CAMERA, 0.5, live=True), scene.render(CAMERA, 0.5))
+
+
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda session: pickle.loads(pickle.dumps(session))])
+def test_a_copy_draws_the_same_and_is_edited_alone(bent, copied):
+    before, edit = bent.gaussians_at(0.3), bent.edit
+    other = copied(bent)
+    assert same(other.gaussians_at(0.3), before) and same(other.gaussians_at(0.6), bent.gaussians_at(0.6))
+    other.move("right", [0.0, 0.3, 0.0])
+    assert bent.edit is edit and same(bent.gaussians_at(0.3), before) and not same(other.gaussians_at(0.3), before)
 
 
 def test_what_is_pinned_keeps_its_bits_and_the_handle_goes_where_it_is_put(bent):
