@@ -11,6 +11,7 @@ import numpy as np
 
 from ..config.bounds import MOST_NODES
 from ..errors import UserError
+from ..scene.arguments import clamped_time, given_scalar
 from ..types import Gaussians
 from . import edit_file, skeleton_file
 from .document import Edit
@@ -186,7 +187,7 @@ class Posing:
 
     def joint_of(self, part: str, time: float, at: float | None = None) -> np.ndarray:
         """Return where a part's joint is under the edit, [3]."""
-        return self._motion_of(self.edit, part, time, at)[1]
+        return self._motion_of(self.edit, part, clamped_time(time), at)[1]
 
     def turn(self, part: str, degrees: float, axis: Sequence[float] | None = None, time: float = 0.0) -> Target:
         """Turn a part, with all that hangs on it, about its joint, relative to its parent. Repeated turns add up.
@@ -200,18 +201,17 @@ class Posing:
             UserError: there is no such part, the motion shows no axis and none is given, or a number is wrong.
         """
         skeleton = self.skeleton
+        axis = skeleton.part(part).axis if axis is None else axis
         if axis is None:
-            axis = skeleton.part(part).axis
-            if axis is None:
-                raise UserError(f"part {part!r}: the motion shows no axis; give one, such as (0, 0, 1)")
-        direction = np.asarray(axis, np.float64)
-        if direction.shape != (3,) or not np.isfinite(direction).all() or not np.linalg.norm(direction) > 1e-6:
+            raise UserError(f"part {part!r}: the motion shows no axis; give one, such as (0, 0, 1)")
+        direction, angle = point_of("axis", axis), given_scalar("degrees", degrees, "-180 to 180")
+        if not np.linalg.norm(direction) > 1e-6:
             raise UserError(f"axis {list(axis)}: give 3 finite numbers, not all close to 0")
-        if not -180.0 <= degrees <= 180.0:
-            raise UserError(f"degrees {degrees:g}: give -180 to 180")
+        if not -180.0 <= angle <= 180.0:
+            raise UserError(f"degrees {angle:g}: give -180 to 180")
         edit, handle = _with_handle(self.edit, skeleton, part, time)
         old = edit.targets.get(handle.name, STAY)
-        further = self._into_frame(skeleton, handle, from_axis(direction, degrees), time)
+        further = self._into_frame(skeleton, handle, from_axis(direction, angle), time)
         target = Target.of(old.translation, multiply(further, np.array(old.rotation)).tolist())
         self.apply(dataclasses.replace(edit, targets={**edit.targets, handle.name: target}))
         return target
@@ -246,8 +246,7 @@ class Posing:
         place = point_of("to", to)
         before = since or self._before_drag or self.edit
         skeleton = before.skeleton or self._run_skeleton()
-        names = skeleton.chain(part)
-        edit, handles = before, []
+        names, edit, handles = skeleton.chain(part), before, []
         for name in names:
             edit, handle = _with_handle(edit, skeleton, name, time)
             handles.append(handle)
@@ -388,12 +387,13 @@ class Posing:
 def _with_handle(edit: Edit, skeleton: Skeleton, part: str, time: float) -> tuple[Edit, Handle]:
     """Return the edit with a handle that poses a part at a time, and that handle; the same edit if it has one."""
     nodes = skeleton.part(part).nodes
-    FieldReader({"time": float(time)}, f"part {part!r}").number("time", None, 0.0, 1.0)
+    time = given_scalar(f"part {part!r}: time", time, "a number from 0 to 1")
+    FieldReader({"time": time}, f"part {part!r}").number("time", None, 0.0, 1.0)
     own = [row for row, handle in enumerate(edit.handles) if handle.part == part]
     acting = [edit.handles[row] for row in own if edit.handles[row].strength(time, edit.reach) > 0.0]
     if acting:
         return edit, acting[-1]  # which counts
-    handle = Handle(edit.free_name(part), nodes, float(time), part=part)
+    handle = Handle(edit.free_name(part), nodes, time, part=part)
     row = own[0] if own else len(edit.handles)  # those of other moments count more
     handles = (*edit.handles[:row], handle, *edit.handles[row:])
     return dataclasses.replace(edit, handles=handles, skeleton=skeleton), handle

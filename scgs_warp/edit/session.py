@@ -18,7 +18,7 @@ from ..errors import UserError
 from ..formats.gaussian_ply import write_gaussian_ply
 from ..rendering.render import render
 from ..runtime.caller_settings import unaffected_methods
-from ..scene.arguments import given_camera, given_color
+from ..scene.arguments import clamped_time, given_camera, given_color, given_scalar
 from ..scene.scene import Scene
 from ..storage.files import write_atomically
 from ..storage.output_folders import make_parent
@@ -139,8 +139,7 @@ class EditSession(Posing):
     ) -> np.ndarray:
         """Return the edited control points, [M, 3], world units."""
         bent = self._bend(time, at, live, frame)
-        time = min(max(float(time), 0.0), 1.0)
-        positions = self.engine.motion_at(time).positions if bent is None else bent.positions
+        positions = self.engine.motion_at(clamped_time(time)).positions if bent is None else bent.positions
         return self.engine.to_world(positions)
 
     def nearest(self, point: Sequence[float], time: float, at: float | None = None) -> int:
@@ -188,7 +187,7 @@ class EditSession(Posing):
         taken = {handle.name for handle in self.edit.handles}
         if name is None:
             name = next(f"handle {i}" for i in range(1, len(taken) + 2) if f"handle {i}" not in taken)
-        handle = Handle(name=name, nodes=chosen, time=float(time), **fields)
+        handle = Handle(name=name, nodes=chosen, time=given_scalar("time", time, "a number from 0 to 1"), **fields)
         edit = self.edit.without(name)
         self.apply(dataclasses.replace(edit, handles=(*edit.handles, handle)))
         return handle
@@ -225,7 +224,7 @@ class EditSession(Posing):
         bent = self._bend(time, at, live)
         if bent is None:
             return IDENTITY.copy()
-        base = self.engine.base_at(self.edit, min(max(float(time), 0.0), 1.0))
+        base = self.engine.base_at(self.edit, clamped_time(time))
         return mean(multiply(bent.turns[nodes], conjugate(base.turns[nodes]))[:, None])[0]
 
     def pin(self, nodes: Iterable[int]) -> None:
@@ -331,12 +330,10 @@ class EditSession(Posing):
 
     def scene_time(self, at: float) -> float:
         """Return the scene time that a moment of the film shows."""
-        return self.edit.playback.time_at(at, self.edit.film.seconds)
+        return self.edit.playback.time_at(given_scalar("at", at, "seconds of the film"), self.edit.film.seconds)
 
     def _bend(self, time: float, at: float | None, live: bool, frame: float | None = None) -> NodePose | None:
-        if not (math.isfinite(time) and (at is None or math.isfinite(at))):
-            raise UserError(f"time {time}, at {at}: give finite numbers")
-        time = min(max(float(time), 0.0), 1.0)
+        time, at = clamped_time(time), None if at is None else given_scalar("at", at, "seconds of the film")
         frame = self.edit.reach if frame is None else frame
         if live and at is None:
             return self.engine.bend_live(self.edit, time, frame=frame)
@@ -348,7 +345,7 @@ class EditSession(Posing):
         """Return activated Gaussians under the edit, world units; bit-identical to the scene's if the edit changes
         nothing."""
         bent = self._bend(time, at, live, frame)
-        return self.engine.gaussians(min(max(float(time), 0.0), 1.0), bent)
+        return self.engine.gaussians(clamped_time(time), bent)
 
     @torch.no_grad()
     def render(
@@ -362,8 +359,7 @@ class EditSession(Posing):
         frame: float | None = None,
     ) -> Image:
         """Render the edited scene; bit-identical to ``Scene.render`` if the edit changes nothing."""
-        bent = self._bend(time, at, live, frame)
-        time = min(max(float(time), 0.0), 1.0)
+        bent, time = self._bend(time, at, live, frame), clamped_time(time)
         scene = self.scene
         if bent is None:
             return scene.render(camera, time, background)  # type: ignore[arg-type]

@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
+from ..errors import UserError
+from ..ops.shapes import given_whole, shown
 from ..types import Camera
 
 LAST_ROWS = {"viewmat": (0.0, 0.0, 0.0, 1.0), "K": (0.0, 0.0, 1.0)}
@@ -20,8 +23,10 @@ def given_camera(camera: Camera) -> Camera:
     Raises:
         ValueError: naming the matrix or the size that is wrong.
     """
+    if not all(hasattr(camera, name) for name in (*LAST_ROWS, "width", "height")):
+        raise ValueError(f"camera must be a scgs_warp.Camera(viewmat, K, width, height), got {type(camera).__name__}")
     viewmat, K = (_matrix(name, getattr(camera, name), len(row)) for name, row in LAST_ROWS.items())
-    width, height = (_whole(name, getattr(camera, name)) for name in ("width", "height"))
+    width, height = (given_whole(name, getattr(camera, name)) for name in ("width", "height"))
     if width < 1 or height < 1:
         raise ValueError(f"width and height must be positive, got {width} x {height}")
     return Camera(viewmat, K, width, height)
@@ -44,6 +49,33 @@ def given_color(color: Sequence[float] | Tensor) -> Tensor:
     return held
 
 
+def given_scalar(name: str, value: float, wanted: str) -> float:
+    """Return a time or another finite number that a caller gives.
+
+    Args:
+        wanted: what the argument must be, for the message.
+
+    Raises:
+        UserError: it is no number, or non-finite.
+    """
+    try:
+        fits = math.isfinite(value)
+    except (TypeError, ValueError, RuntimeError):  # RuntimeError: a tensor of several numbers
+        fits = False
+    if not fits:
+        raise UserError(f"{name} is {shown(value)}; give {wanted}")
+    return float(value)
+
+
+def clamped_time(time: float) -> float:
+    """Clamp ``time`` to [0, 1].
+
+    Raises:
+        UserError: the time is no number, or non-finite.
+    """
+    return min(max(given_scalar("time", time, "a number from 0 (the first moment) to 1 (the last)"), 0.0), 1.0)
+
+
 def _matrix(name: str, value: Tensor | Sequence[Sequence[float]], size: int) -> Tensor:
     try:
         held = torch.as_tensor(value, dtype=torch.float32)
@@ -61,14 +93,3 @@ def _matrix(name: str, value: Tensor | Sequence[Sequence[float]], size: int) -> 
     if name == "K" and not (held[0, 0] and held[1, 1]):
         raise ValueError("K[0, 0] and K[1, 1], the focal lengths in pixels, must not be 0")
     return held
-
-
-def _whole(name: str, value: object) -> int:
-    try:
-        whole = int(value)  # type: ignore[call-overload]
-        fits = bool(whole == value)
-    except (TypeError, ValueError, OverflowError):
-        fits = False
-    if not fits:
-        raise ValueError(f"{name} must be a whole number, got {value!r:.80}")
-    return whole

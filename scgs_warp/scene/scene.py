@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -31,20 +30,9 @@ from ..storage.files import read_text
 from ..storage.json_files import parse_json
 from ..types import Camera, Gaussians, Image
 from . import film_maker, page_maker
-from .arguments import given_camera, given_color
+from .arguments import clamped_time, given_camera, given_color
 from .frame_graph import FrameGraph
 from .validation import check_metadata, check_motion, check_settings, check_tensors, reason
-
-
-def clamped_time(time: float) -> float:
-    """Clamp ``time`` to [0, 1].
-
-    Raises:
-        UserError: the time is non-finite.
-    """
-    if not math.isfinite(time):
-        raise UserError(f"time is {time}; give a number from 0 (the first moment) to 1 (the last)")
-    return min(max(float(time), 0.0), 1.0)
 
 
 class Scene:

@@ -277,6 +277,11 @@ def test_no_edge_of_the_poser_bridges_a_gap_and_none_is_missed(session):
         (lambda s: s.turn("head", 10), "the motion shows no axis"),
         (lambda s: s.turn("head", 10, (0, 0, 0)), "not all close to 0"),
         (lambda s: s.turn("head", 200, (0, 0, 1)), "give -180 to 180"),
+        (lambda s: s.turn("head", None, (0, 0, 1)), "degrees is None; give -180 to 180"),
+        (lambda s: s.turn("head", 10, "up"), 'axis "up": give 3 finite numbers'),
+        (lambda s: s.turn("head", 10, (0, 0, 1), None), "time is None; give a number from 0 to 1"),
+        (lambda s: s.pull("head", (0, 0, 1), "now"), "time is 'now'; give a number from 0 to 1"),
+        (lambda s: s.joint_of("head", None), "time is None; give a number"),
         (lambda s: s.pull("head", (0, float("nan"), 1)), "give 3 finite numbers"),
         (lambda s: s.pull("head", (0, 0)), "give 3 finite numbers"),
         (lambda s: s.part_at(None, 0.0), "point missing: give 3 finite numbers"),
@@ -297,6 +302,10 @@ def test_mistakes_give_one_line_and_change_nothing(session, call, message):
         call(session)
     assert message in str(raised.value) and "\n" not in str(raised.value)
     assert session.edit == before
+
+
+def test_a_joint_outside_the_motion_is_that_of_its_end(session):
+    assert np.array_equal(session.joint_of("elbow_left", 7), session.joint_of("elbow_left", 1.0))
 
 
 def test_a_part_is_found_where_an_edit_has_put_it(session):

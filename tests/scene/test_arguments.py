@@ -12,6 +12,7 @@ import torch
 from helpers.edit_scenes import bar_scene
 from helpers.tiny import tiny_camera
 from scgs_warp.edit import EditSession
+from scgs_warp.errors import UserError
 from scgs_warp.scene.mean import MeanScene
 from scgs_warp.types import Camera
 
@@ -72,6 +73,18 @@ WRONG = [
 def test_a_camera_that_shows_nothing_is_refused(drawer, fields, words):
     with pytest.raises(ValueError, match=words):
         drawer.render(camera(**fields), 0.3)
+
+
+@pytest.mark.parametrize("time", [None, "0.3", [0.3], torch.linspace(0, 1, 99), np.ones(2), math.nan])
+def test_a_time_that_is_no_number_is_refused(drawer, time):
+    for call in (drawer.gaussians_at, lambda time: drawer.render(camera(), time)):
+        with pytest.raises(UserError, match=r"^time is .*; give a number from 0 .*$"):
+            call(time)
+
+
+def test_what_is_no_camera_is_refused(drawer):
+    with pytest.raises(ValueError, match=r"camera must be a scgs_warp\.Camera\(.*\), got tuple"):
+        drawer.render((torch.eye(4), torch.eye(3), 24, 24), 0.3)
 
 
 @pytest.mark.parametrize("color", ["white", (1.0, 1.0), 1.0, (math.nan, 0.0, 0.0)])
