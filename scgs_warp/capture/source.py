@@ -18,7 +18,7 @@ from ..data.images import INSPECTED, header_sizes, instead_of_image, is_complete
 from ..data.name_times import moments_in_names
 from ..data.orientation import TURNS, read_orientation, upright
 from ..errors import UserError
-from ..storage.files import open_regular
+from ..storage.files import for_ffmpeg, open_regular
 from ..storage.heif_files import heif_orientation, heif_size, is_heif, read_heif
 from . import cut_out
 from .animation import Animation, is_animation
@@ -100,7 +100,7 @@ class Video:
         from av.error import FFmpegError
 
         try:
-            container = av.open(str(self.path))
+            container = av.open(for_ffmpeg(self.path))
         except (FFmpegError, OSError, ValueError) as error:  # ValueError: metadata that is not text
             raise UserError(f"{self.path}: {_no_video(self.path, error)}") from None
         if not container.streams.video:

@@ -79,6 +79,12 @@ def read_bytes(path: Path, remedy: str) -> bytes:
         raise UserError(f"{path}: cannot be read ({error.strerror}); {remedy}") from None
 
 
+def for_ffmpeg(path: Path) -> str:
+    """Return the name by which FFmpeg opens a file: in a relative one, it takes what stands before a colon (``clip:2``)
+    for a protocol."""
+    return str(path.absolute())
+
+
 def temporary_of(path: Path) -> Path:
     """Return the temporary name for writing ``path`` in a folder that has one writer. It is fixed, so that killed
     processes leave one file at most."""

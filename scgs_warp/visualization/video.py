@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import UserError
+from ..storage.files import for_ffmpeg
 from ..storage.output_folders import holds_only, make_parent, replace_folder
 
 SUFFIXES = (".mp4", ".gif", "")
@@ -155,7 +156,7 @@ class _Mp4(FilmWriter):
         from av.video.reformatter import ColorRange, Colorspace
 
         height, width = frame.shape[:2]
-        self._container = av.open(str(self.temporary), "w", format="mp4", options={"movflags": "+faststart"})
+        self._container = av.open(for_ffmpeg(self.temporary), "w", format="mp4", options={"movflags": "+faststart"})
         rate = Fraction(self.fps).limit_denominator(1000)
         # x264's macroblock tree reads uninitialised memory (AVX-512), which changes the bits of some films.
         options = {"crf": str(self.quality), "preset": "medium", "x264-params": "mbtree=0"}

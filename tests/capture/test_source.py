@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import hashlib
+import os
 from fractions import Fraction
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -28,6 +30,15 @@ def test_a_video_keeps_its_moments(tmp_path):
     assert video.count == 10 and [still.index for still in stills] == list(range(10))
     np.testing.assert_allclose([still.seconds for still in stills], np.arange(10) / 12.5, atol=1e-3)
     assert stills[0].image.shape == (60, 80, 3)
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows allows no colon in a file's name")
+def test_the_name_of_a_film_may_hold_a_colon(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with film("take:2.mp4", 10) as writer:
+        for level in (0, 100, 200):
+            writer.write(np.full((16, 16, 3), level, np.uint8))
+    assert open_source(Path("take:2.mp4")).count == 3 and len(frame_seconds(Path("take:2.mp4"))) == 3
 
 
 def test_pixels_are_made_square(tmp_path):

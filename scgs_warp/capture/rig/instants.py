@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ...errors import UserError
+from ...storage.files import for_ffmpeg
 from ..completeness import Incomplete, header_of, incomplete, lost_in_gaps
 from ..source import main_pictures
 
@@ -76,7 +77,7 @@ def recorded(path: Path) -> Recorded:
     from av.error import FFmpegError
 
     try:
-        with av.open(str(path)) as container:
+        with av.open(for_ffmpeg(path)) as container:
             if not container.streams.video:
                 raise UserError(f"{path}: holds no pictures; take it out of the folder")
             stream = main_pictures(container)
@@ -117,7 +118,7 @@ def _first_stamp(path: Path) -> int | None:
     import av
     from av.error import FFmpegError
 
-    with av.open(str(path)) as container:
+    with av.open(for_ffmpeg(path)) as container:
         for packet in container.demux(main_pictures(container)):
             try:
                 for frame in packet.decode():

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ...errors import UserError
+from ...storage.files import for_ffmpeg
 from ..source import main_pictures
 
 RATE = 16_000
@@ -37,7 +38,7 @@ def read_sound(path: Path) -> Sound | None:
     from av.error import FFmpegError
 
     try:
-        with av.open(str(path)) as container:
+        with av.open(for_ffmpeg(path)) as container:
             if not container.streams.audio:
                 return None
             first_frame = _first_second(container)

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from ....storage.files import for_ffmpeg
 from .sound import SAMPLE_RATE
 
 
@@ -25,7 +26,7 @@ def write_film(path: Path, pictures: Sequence[np.ndarray], fps: float, crf: int,
     import av
 
     height, width = pictures[0].shape[:2]
-    with av.open(str(path), "w", format="mp4") as container:
+    with av.open(for_ffmpeg(path), "w", format="mp4") as container:
         # One thread and no macroblock tree: the same pictures give the same bytes.
         options = {"crf": str(crf), "preset": "medium", "x264-params": "mbtree=0:threads=1"}
         video: Any = container.add_stream("libx264", rate=Fraction(fps).limit_denominator(1000), options=options)
@@ -47,6 +48,6 @@ def decoded(path: Path) -> Iterator[np.ndarray]:
     """Yield the pictures [H, W, 3] uint8 RGB of a film."""
     import av
 
-    with av.open(str(path)) as container:
+    with av.open(for_ffmpeg(path)) as container:
         for frame in container.decode(video=0):
             yield frame.to_ndarray(format="rgb24")
