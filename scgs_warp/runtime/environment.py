@@ -110,7 +110,7 @@ def container_quota(folder: str = "/sys/fs/cgroup") -> float:
     """Return the control group's limit on processor time, in processors (Linux); infinite without a limit."""
     for names in (("cpu.max",), ("cpu/cpu.cfs_quota_us", "cpu/cpu.cfs_period_us")):  # version 2, version 1
         try:
-            words = " ".join(Path(folder, name).read_text() for name in names).split()
+            words = " ".join(Path(folder, name).read_text(encoding="ascii") for name in names).split()
             quota, period = float(words[0]), float(words[1])
         except (OSError, ValueError, IndexError):  # not Linux, no limit ("max"), or another layout
             continue

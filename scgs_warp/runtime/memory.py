@@ -227,7 +227,7 @@ def free_in_groups(root: str = "/sys/fs/cgroup", own: str = "/proc/self/cgroup")
 
 def _free_in_group(folder: Path, most: str, used: str, droppable: str) -> Iterator[float]:
     with contextlib.suppress(OSError, ValueError):
-        bound, taken = int((folder / most).read_text()), int((folder / used).read_text())
-        words = (folder / "memory.stat").read_text().split()
+        bound, taken = (int((folder / name).read_text(encoding="ascii")) for name in (most, used))
+        words = (folder / "memory.stat").read_text(encoding="ascii").split()
         dropped = int(words[words.index(droppable) + 1]) if droppable in words else 0
         yield bound - taken + dropped

@@ -254,7 +254,8 @@ def progress(total: int, description: str, *, start: int = 0, stream: TextIO | N
     Yields:
         An object whose ``advance(n=1, **fields)`` the loop calls.
     """
-    shown_on: TextIO = stream or sys.stdout or open(os.devnull, "w")  # a daemon may have no standard output
+    # A daemon may have no standard output.
+    shown_on: TextIO = stream or sys.stdout or open(os.devnull, "w", encoding="utf-8")
     report = _report.get()
     if report is not None:
         shown: Progress = _Reported(total, description, shown_on, start)

@@ -68,7 +68,7 @@ def join_processes(where: ProcessRank | None, device: str) -> Iterator[ProcessGr
     try:
         with contextlib.ExitStack() as stack:
             if where.rank > 0:
-                nowhere = stack.enter_context(open(os.devnull, "w"))
+                nowhere = stack.enter_context(open(os.devnull, "w", encoding="utf-8"))
                 stack.enter_context(contextlib.redirect_stdout(nowhere))
             yield ProcessGroup(where)
     finally:

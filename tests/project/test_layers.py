@@ -188,6 +188,24 @@ def test_sizes(path):
             assert length < limit, f"{path.name}:{node.lineno} {node.name} has {length} lines"
 
 
+def is_text_of_a_system(call: ast.Call) -> bool:
+    """Return whether a call reads or writes text without naming its encoding, which differs from system to system."""
+    named = {keyword.arg for keyword in call.keywords}
+    if isinstance(call.func, ast.Attribute):
+        return call.func.attr in ("read_text", "write_text") and "encoding" not in named
+    if not isinstance(call.func, ast.Name) or call.func.id != "open" or "encoding" in named:
+        return False
+    mode = call.args[1] if len(call.args) > 1 else ast.Constant("r")
+    return isinstance(mode, ast.Constant) and "b" not in str(mode.value)
+
+
+@pytest.mark.parametrize("path", SOURCES, ids=relative)
+def test_text_has_an_encoding(path):
+    """Programs run with ``PYTHONWARNDEFAULTENCODING`` and warnings as errors, too."""
+    calls = [node for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))) if isinstance(node, ast.Call)]
+    assert [call.lineno for call in calls if is_text_of_a_system(call)] == []
+
+
 @pytest.mark.parametrize("path", HEADERS, ids=relative)
 def test_sizes_of_headers(path):
     assert path.read_text(encoding="utf-8").count("\n") < MAX_FILE

@@ -139,7 +139,7 @@ def _write_scene(work: Path, recipe: dict[str, Any], progress: Callable[[int, in
 
     optics = Optics(FIELD_OF_VIEW, recipe["size"], recipe["size"], SAMPLES)
     write_pictures(work, subject, points, pictures, optics, done)
-    (work / MARKER).write_text(json.dumps(recipe) + "\n")
+    (work / MARKER).write_text(json.dumps(recipe) + "\n", encoding="utf-8")
 
 
 def random_camera(rng: np.random.Generator) -> np.ndarray:

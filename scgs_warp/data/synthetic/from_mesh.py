@@ -278,7 +278,7 @@ def synthesize(planned: SynthesisPlan, progress: Callable[[int, int], None] | No
         if isinstance(planned.subject, RodsSubject):
             times = {split: [picture.time for picture in own] for split, own in planned.pictures.items()}
             planned.subject.write_rods(work, times)
-        (work / MARKER).write_text(json.dumps(planned.recipe, indent=1) + "\n")
+        (work / MARKER).write_text(json.dumps(planned.recipe, indent=1) + "\n", encoding="utf-8")
 
     write_folder_atomically(planned.folder, write)
     return planned.folder

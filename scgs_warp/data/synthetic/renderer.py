@@ -191,7 +191,7 @@ def write_pictures(
                 watch(split, index, planned, camera, image, seen)
             done()
         content = {"camera_angle_x": optics.fov, "frames": entries}
-        (folder / f"transforms_{split}.json").write_text(json.dumps(content, indent=1) + "\n")
+        (folder / f"transforms_{split}.json").write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
     times = np.linspace(0.0, 1.0, GROUND_TRUTH_TIMES)
     np.savez(
         folder / "ground_truth.npz",

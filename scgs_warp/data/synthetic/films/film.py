@@ -96,7 +96,7 @@ def _write(work: Path, plan: FilmPlan, done: Callable[[], object]) -> None:
     if request.kind == "phone":
         write_data_set(work, stage, shooting, request, rng, done)
         write_ground_truth(work, stage, shooting, points)
-    (work / MARKER).write_text(json.dumps(_recipe(request), indent=1) + "\n")
+    (work / MARKER).write_text(json.dumps(_recipe(request), indent=1) + "\n", encoding="utf-8")
 
 
 def _recipe(request: FilmRequest) -> dict[str, Any]:

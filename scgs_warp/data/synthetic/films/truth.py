@@ -132,7 +132,7 @@ def write_data_set(
         "train_filenames": train,
         "test_filenames": test,
     }
-    (folder / "transforms.json").write_text(json.dumps(content, indent=1) + "\n")
+    (folder / "transforms.json").write_text(json.dumps(content, indent=1) + "\n", encoding="utf-8")
 
 
 def _depth_of(folder: Path, take: Take, index: int, request: FilmRequest) -> str:
