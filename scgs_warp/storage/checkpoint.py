@@ -128,7 +128,8 @@ def read(
     try:
         with safe_open(path, framework="pt") as file:
             metadata = parse_json((file.metadata() or {})[METADATA_KEY])
-            tensors = {key: file.get_tensor(key) for key in file.keys() if key.startswith(prefixes)}
+            # Copied, since these are views of the file: Windows would not let the next checkpoint replace it.
+            tensors = {key: file.get_tensor(key).clone() for key in file.keys() if key.startswith(prefixes)}
         if not isinstance(metadata, dict):
             raise ValueError("no metadata")
         sums = metadata.get("crc32", {})  # early runs have no check sums

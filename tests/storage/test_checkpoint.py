@@ -20,6 +20,16 @@ def test_round_trip(tmp_path: Path):
     assert metadata["step"] == 3 and metadata["name"] == "x" and metadata["format"] == checkpoint.FORMAT
 
 
+def test_what_was_read_does_not_follow_the_file(tmp_path: Path):
+    """A view of the file would also keep Windows from replacing it, as a resumed training does."""
+    checkpoint.write(tmp_path, {"a": torch.ones(100_000)}, {})
+    tensors, _ = checkpoint.read(tmp_path)
+    path = tmp_path / checkpoint.FILE
+    with path.open("r+b") as file:
+        file.write(bytes(path.stat().st_size))
+    assert tensors["a"].eq(1.0).all()
+
+
 def test_prefixes_choose_tensors(tmp_path: Path):
     checkpoint.write(tmp_path, TENSORS, {})
     tensors, _ = checkpoint.read(tmp_path, ("scene.", "adam."))
