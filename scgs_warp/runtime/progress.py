@@ -55,12 +55,19 @@ def mute(stream: TextIO) -> None:
         os.close(nowhere)
 
 
+def encodable(text: str, stream: TextIO | None) -> str:
+    """Return a text with the characters escaped that a stream cannot encode: lines name files, and a program's output
+    may go to a file in the encoding of the system."""
+    encoding = getattr(stream, "encoding", None) or "utf-8"
+    return text.encode(encoding, "backslashreplace").decode(encoding)
+
+
 def say(text: str) -> None:
     """Print a line on standard output. A closed terminal or pipe does not raise an error."""
     if _report.get() is not None:
         return
     try:
-        print(text, flush=True)
+        print(encodable(text, sys.stdout), flush=True)
     except OSError:
         mute(sys.stdout)
 
@@ -118,7 +125,7 @@ class Progress:
             return otherwise
 
     def _print(self, text: str) -> None:
-        print(text, file=self._stream, flush=True)
+        print(encodable(text, self._stream), file=self._stream, flush=True)
 
     def _finish(self, completed: bool) -> None:
         raise NotImplementedError
@@ -234,7 +241,7 @@ class _TerminalBar(Progress):
         return now + REDRAW_SECONDS
 
     def _print(self, text: str) -> None:
-        self._rich.console.print(text, markup=False, highlight=False)
+        self._rich.console.print(encodable(text, self._stream), markup=False, highlight=False)
 
     def _finish(self, completed: bool) -> None:
         self._draw(time.perf_counter())

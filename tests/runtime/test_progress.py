@@ -78,6 +78,20 @@ def test_work_goes_on_where_nobody_reads() -> None:
     stream.file.close()
 
 
+def test_what_a_stream_cannot_encode_is_escaped(monkeypatch: pytest.MonkeyPatch) -> None:
+    stream = io.TextIOWrapper(io.BytesIO(), encoding="cp1252")
+    monkeypatch.setattr("sys.stdout", stream)
+    say("\u6570\u636e/\udcff: 3 images left out")
+    with progress(1, "training") as shown:
+        shown.print("runs/\u6570\u636e")
+        shown.advance(note="\u2192")
+    stream.seek(0)
+    lines = stream.buffer.read().decode("cp1252").splitlines()
+    assert (
+        lines[:2] == [r"\u6570\u636e/\udcff: 3 images left out", r"runs/\u6570\u636e"] and r"note \u2192" in lines[-1]
+    )
+
+
 def test_say_prints_one_line(capsys: pytest.CaptureFixture) -> None:
     say("done")
     assert capsys.readouterr().out == "done\n"
