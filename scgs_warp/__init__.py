@@ -39,6 +39,8 @@ _EXPORTS = {
     "rasterization": "rendering.rasterize",
     "train": "training.one_call",
 }
+_PACKAGES = ("data", "edit")
+"""Packages whose names can be used as ``scgs_warp.data.load`` without an import of their own."""
 __all__ = ["Camera", "Frame", "Gaussians", "Image", "Pose", "Scene", "__version__", "fit", "rasterization", "train"]
 
 
@@ -56,7 +58,14 @@ _page_maker.register(_framed_page)
 _film_maker.register(_film)
 
 
+def __dir__() -> list[str]:
+    """Return the names that are loaded when they are first used, too, for completion in notebooks."""
+    return sorted({*globals(), *__all__, *_PACKAGES})
+
+
 def __getattr__(name: str):
+    if name in _PACKAGES:
+        return importlib.import_module(f".{name}", __name__)
     if name not in _EXPORTS:
         raise AttributeError(f"module 'scgs_warp' has no attribute {name!r}")
     return getattr(importlib.import_module(f".{_EXPORTS[name]}", __name__), name)

@@ -24,6 +24,15 @@ def run(tmp_path_factory):
     return moving_run(tmp_path_factory.mktemp("scripts") / "run")
 
 
+def test_names_are_offered_and_used_before_anything_is_loaded():
+    program = (
+        "import sys, scgs_warp as s; print({*s.__all__, 'data', 'edit'} - {*dir(s)}, 'torch' in sys.modules); "
+        "print(s.data.load.__name__, s.edit.EditSession.__name__, hasattr(s, 'metal'))"
+    )
+    told = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout
+    assert told.splitlines() == ["set() False", "load EditSession False"]
+
+
 @pytest.mark.parametrize("name", ["run", "."])
 def test_the_program_changes_its_directory(run, name, tmp_path, monkeypatch):
     """The parts of the run stay those that its folder keeps, and the page in a notebook has a title."""
