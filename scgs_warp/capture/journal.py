@@ -16,6 +16,7 @@ from ..errors import UserError
 from ..storage.files import read_text
 from ..storage.json_files import parse_json
 from ..storage.locks import AlreadyLocked, lock_file
+from ..storage.output_folders import paths_in
 from .writing import FILE, write_text
 
 WORK = "work"
@@ -24,7 +25,6 @@ JOURNAL = "journal.json"
 LOCK = ".lock"
 LEFT = re.compile(r"\.journal\.json\.\w+\.tmp|\.lock")
 """Names of what a killed writer of the journal leaves."""
-OF_SYSTEMS = (".DS_Store", "Thumbs.db", "desktop.ini", ".directory")
 NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EROFS, errno.EFBIG)
 
 
@@ -55,7 +55,7 @@ class Journal:
         """Read what the folder holds."""
         folder = self.folder
         self._stages: dict[str, dict[str, Any]] = {}
-        if folder.exists() and (not folder.is_dir() or self._content()):
+        if folder.exists() and (not folder.is_dir() or paths_in(self.folder)):
             content = {"source": self._source, "stages": {}} if self._is_bare() else _read(self.file)
             if content is None:
                 what = "a finished data set" if (folder / self._marker).is_file() else "something else"
@@ -72,14 +72,10 @@ class Journal:
         self._key = self._source
         self.finished = (folder / self._marker).exists()
 
-    def _content(self) -> list[Path]:
-        """List what is in the folder, without what systems put into every folder that they show."""
-        return [path for path in self.folder.iterdir() if path.name not in OF_SYSTEMS]
-
     def _is_bare(self) -> bool:
         """Return whether the folder holds only what an attempt leaves that ends before its first entry: on a full disk,
         or by a kill."""
-        if not self.folder.is_dir() or self.work.is_symlink() or self._content() != [self.work]:
+        if not self.folder.is_dir() or self.work.is_symlink() or paths_in(self.folder) != [self.work]:
             return False
         return self.work.is_dir() and all(LEFT.fullmatch(path.name) for path in self.work.iterdir())
 

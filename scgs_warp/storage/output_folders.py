@@ -10,6 +10,7 @@ from pathlib import Path
 
 from ..errors import UserError
 
+OF_SYSTEMS = (".DS_Store", "Thumbs.db", "desktop.ini", ".directory")
 ATTEMPTS = 5
 """Number of attempts to replace a folder that other processes replace at the same time."""
 
@@ -28,9 +29,15 @@ def make_parent(path: Path) -> None:
         raise UserError(f"{path.parent}: cannot be written ({error.strerror}); give another output folder") from None
 
 
+def paths_in(folder: Path) -> list[Path]:
+    """List what is in a folder, without what file managers put into every folder that they show."""
+    return [path for path in folder.iterdir() if path.name not in OF_SYSTEMS and not path.name.startswith("._")]
+
+
 def holds_only(folder: Path, pattern: str) -> bool:
-    """Return whether a folder may be replaced: all names in it match a regular expression."""
-    return all(re.fullmatch(pattern, entry.name) for entry in folder.iterdir())
+    """Return whether a folder may be replaced: all names in it that ``paths_in`` lists match a regular
+    expression."""
+    return all(re.fullmatch(pattern, path.name) for path in paths_in(folder))
 
 
 def replace_folder(path: Path, new: Path) -> None:

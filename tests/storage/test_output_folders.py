@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from scgs_warp.errors import UserError
-from scgs_warp.storage.output_folders import holds_only, make_parent, replace_folder
+from scgs_warp.storage.output_folders import holds_only, make_parent, paths_in, replace_folder
 
 
 def filled(folder: Path, text: str) -> Path:
@@ -33,6 +33,12 @@ def test_holds_only_matches_whole_names(tmp_path: Path):
     assert holds_only(folder, r"\d{4}\.png")
     (folder / "0001.png.bak").touch()
     assert not holds_only(folder, r"\d{4}\.png")
+
+
+def test_what_file_managers_leave_is_no_content(tmp_path: Path):
+    for name in ("0001.png", ".DS_Store", "._0001.png", "Thumbs.db"):
+        (tmp_path / name).touch()
+    assert paths_in(tmp_path) == [tmp_path / "0001.png"] and holds_only(tmp_path, r"\d+\.png")
 
 
 @pytest.mark.parametrize("exists", [False, True])

@@ -19,6 +19,7 @@ from ...data.synthetic.renderer import write_folder_atomically
 from ...errors import UserError
 from ...runtime.progress import progress
 from ...storage.files import read_bytes
+from ...storage.output_folders import paths_in
 from ...visualization.video import write_png
 from ..similarity import Similarity, upright
 from ..source import read_rgb
@@ -92,7 +93,7 @@ def import_scene(path: Path, folder: Path, show: ShowProgress = progress) -> Imp
     Raises:
         UserError: the scene is invalid, or the folder holds something.
     """
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+    if folder.exists() and (not folder.is_dir() or paths_in(folder)):
         raise UserError(f"{folder}: exists and holds something else; give another --output, or remove it")
     with unpacked(path, folder, show) as place:
         return _import(read_scene(place), place, folder, show)

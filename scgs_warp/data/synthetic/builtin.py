@@ -20,6 +20,7 @@ import numpy as np
 from ...errors import UserError
 from ...storage.files import read_text
 from ...storage.json_files import parse_json
+from ...storage.output_folders import paths_in
 from .figure import build_figure
 from .figure_motion import bone_transforms
 from .orbit_cameras import PlannedPicture, instants, random_on_sphere, surrounding
@@ -87,7 +88,7 @@ def _recipe_of(folder: Path) -> dict[str, Any] | None:
 
 def _check_replaceable(folder: Path) -> None:
     """Refuse to replace anything but a synthetic scene or an empty folder."""
-    if not folder.exists() or (folder.is_dir() and (_recipe_of(folder) is not None or not any(folder.iterdir()))):
+    if not folder.exists() or (folder.is_dir() and (_recipe_of(folder) is not None or not paths_in(folder))):
         return
     raise UserError(f"{folder}: exists and holds no synthetic scene ({MARKER}); give another folder, or remove it")
 

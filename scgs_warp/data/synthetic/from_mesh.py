@@ -16,6 +16,7 @@ import numpy as np
 from ...errors import UserError
 from ...storage.files import read_text
 from ...storage.json_files import parse_json
+from ...storage.output_folders import paths_in
 from ..dataset import spread
 from ..gltf.scene import GltfScene, read_scene
 from .contact_sheet import ContactSheet
@@ -223,7 +224,7 @@ def plan_synthesis(folder: str | Path, request: SynthesisRequest, device: str = 
     subject, identity, lines = load_subject(request, device)
     recipe = _recipe(request, identity)
     made = _recipe_of(folder) == recipe
-    if not made and folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+    if not made and folder.exists() and (not folder.is_dir() or paths_in(folder)):
         raise UserError(f"{folder}: exists and holds something else; give another --output, or remove it")
     rng = np.random.default_rng(request.seed)
     points = subject.sample(SURFACE_POINTS, rng)

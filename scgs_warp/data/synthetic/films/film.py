@@ -18,6 +18,7 @@ import numpy as np
 from ....errors import UserError
 from ....storage.files import read_text
 from ....storage.json_files import parse_json
+from ....storage.output_folders import paths_in
 from ..renderer import SURFACE_POINTS, write_folder_atomically
 from .request import FilmRequest, check
 from .shooting import Shooting
@@ -64,7 +65,7 @@ def plan_film(folder: str | Path, request: FilmRequest, device: str = "cpu") -> 
         raise UserError(f"--subject {request.subject}: give one of: {', '.join(SUBJECTS)}")
     check(request)
     made = _recipe_of(folder) == _recipe(request)
-    if not made and folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
+    if not made and folder.exists() and (not folder.is_dir() or paths_in(folder)):
         raise UserError(f"{folder}: exists and holds something else; give another --output, or remove it")
     stage = stage_of(request.subject, device)
     return FilmPlan(folder, request, stage, Shooting.plan(request, stage.floor), made)
