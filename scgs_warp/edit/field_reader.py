@@ -268,12 +268,13 @@ def point_of(name: str, value: Sequence[float]) -> np.ndarray:
     Raises:
         UserError: it is not three finite numbers.
     """
+    plain = plain_values({name: value})[name]  # of tensors on a GPU, and of those that need a gradient, too
     try:
-        point = np.asarray(value, np.float64)
+        point = np.asarray(plain, np.float64)
     except (TypeError, ValueError):
         point = np.zeros(0)
     if point.shape != (3,) or not np.isfinite(point).all() or np.abs(point).max() > MAX_NUMBER:
-        raise UserError(f"{name} {show_value(plain_values({name: value})[name])}: give 3 finite numbers")
+        raise UserError(f"{name} {show_value(plain)}: give 3 finite numbers")
     return point
 
 

@@ -188,7 +188,11 @@ def chosen_nodes(nodes: Iterable[Any], count: int) -> tuple[int, ...]:
     Raises:
         UserError: one is no whole number or does not exist, or the booleans are not as many as the control points.
     """
-    given: list[Any] = nodes.tolist() if isinstance(nodes, np.ndarray | Tensor) else list(nodes)
+    given: Any = nodes.tolist() if isinstance(nodes, np.ndarray | Tensor) else nodes
+    if not isinstance(given, Iterable):
+        raise UserError(
+            f"control points {given!r}: give a list of whole numbers, or one boolean for each control point"
+        )
     given = [node.item() if isinstance(node, np.generic | Tensor) else node for node in given]
     if given and all(isinstance(node, bool) for node in given):
         if len(given) != count:

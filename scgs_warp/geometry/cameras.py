@@ -206,6 +206,15 @@ def overview(cameras: Sequence[Camera], distance: float | None = None) -> Overvi
     )
 
 
+def _vector(name: str, value: Vector) -> np.ndarray:
+    """Return a caller's vector [3] as float64; a tensor may be on a GPU or need a gradient."""
+    plain = value.tolist() if isinstance(value, Tensor) else value
+    vector = np.asarray(plain, np.float64)
+    if vector.shape != (3,) or not np.isfinite(vector).all():
+        raise ValueError(f"{name} must be 3 finite numbers, got {plain!r:.80}")
+    return vector
+
+
 def scaled_camera(camera: Camera, width: int, height: int) -> Camera:
     """Return a camera with the same view in an image of another size."""
     factors = camera.K.new_tensor([width / camera.width, height / camera.height, 1.0])
@@ -224,9 +233,9 @@ def look_at(eye: Vector, target: Vector, up: Vector) -> Tensor:
         [4, 4] world-to-camera, OpenCV (x right, y down, z forward), float32.
 
     Raises:
-        ValueError: eye and target coincide.
+        ValueError: an argument is not three finite numbers, or eye and target coincide.
     """
-    eye, target, up = (np.asarray(vector, np.float64) for vector in (eye, target, up))
+    eye, target, up = (_vector(name, value) for name, value in (("eye", eye), ("target", target), ("up", up)))
     if not np.linalg.norm(target - eye) > 0:
         raise ValueError("eye and target coincide; a camera must look somewhere")
     forward = _unit(target - eye)
@@ -280,7 +289,7 @@ def orbit_camera(
 def azimuth_of(overview: Overview, eye: Vector) -> float:
     """Return the azimuth, 0 to 360 degrees, at which ``orbit_camera`` looks from the side of ``eye`` [3]."""
     zero, ninety = _horizon(np.array(overview.up))
-    offset = np.asarray(eye, np.float64) - np.array(overview.centre)
+    offset = _vector("eye", eye) - np.array(overview.centre)
     return math.degrees(math.atan2(float(offset @ ninety), float(offset @ zero))) % 360.0
 
 

@@ -6,6 +6,7 @@ import dataclasses
 
 import numpy as np
 import pytest
+import torch
 from scipy.sparse.csgraph import connected_components, shortest_path
 
 from helpers.edit_scenes import furthest
@@ -291,6 +292,7 @@ def test_no_edge_of_the_poser_bridges_a_gap_and_none_is_missed(session):
         (lambda s: s.rename_part("head", ""), "give a name"),
         (lambda s: s.merge_parts("head", "knee_left"), "are not neighbours"),
         (lambda s: s.merge_parts("head", "head"), "with itself"),
+        (lambda s: s.split_part("head", None), "control points None: give a list of whole numbers"),
         (lambda s: s.split_part("head", [0, 1, 2]), "choose some but not all"),
         (lambda s: s.move_joint("head", (0, 0, float("inf"))), "joint is"),
         (lambda s: s.save_skeleton(), "no run folder"),
@@ -302,6 +304,11 @@ def test_mistakes_give_one_line_and_change_nothing(session, call, message):
         call(session)
     assert message in str(raised.value) and "\n" not in str(raised.value)
     assert session.edit == before
+
+
+def test_places_may_be_tensors_that_need_a_gradient(session):
+    place = torch.tensor([0.1, 0.2, 0.3], requires_grad=True)
+    assert session.nearest(place, 0.0) == session.nearest([0.1, 0.2, 0.3], 0.0)
 
 
 def test_a_joint_outside_the_motion_is_that_of_its_end(session):

@@ -48,6 +48,16 @@ def test_look_at_is_a_rotation_with_the_target_in_the_middle(eye, target, up) ->
     assert (rotation @ torch.tensor(up, dtype=torch.float64))[1] < 1e-6  # up is upwards: -y
 
 
+def test_look_at_takes_tensors_that_need_a_gradient_and_names_what_is_no_vector() -> None:
+    eye = torch.tensor([0.0, -4.0, 0.0])
+    found = cameras.look_at(eye.clone().requires_grad_(), [0, 0, 0], (0, 0, 1))
+    assert torch.equal(found, cameras.look_at(eye.numpy(), [0, 0, 0], (0, 0, 1))) and not found.requires_grad
+    with pytest.raises(ValueError, match="target must be 3 finite numbers, got "):
+        cameras.look_at(eye, [0, float("nan"), 0], (0, 0, 1))
+    with pytest.raises(ValueError, match=r"up must be 3 finite numbers, got \(0, 1\)"):
+        cameras.look_at(eye, [0, 0, 0], (0, 1))
+
+
 def test_look_at_nowhere_raises() -> None:
     with pytest.raises(ValueError, match="coincide"):
         cameras.look_at([1, 2, 3], [1, 2, 3], [0, 0, 1])
