@@ -179,6 +179,8 @@ WORDS = {int: "a whole number", float: "a number", bool: "true or false", str: "
 
 
 def _checked(value: Any, hint: Any, label: str) -> Any:
+    if getattr(value, "ndim", None) == 0:  # a scalar of NumPy's or torch's, as in a loop over np.arange
+        value = value.item()
     if get_origin(hint) is Literal:
         if value not in get_args(hint):
             raise UserError(f"{label} is {value!r}; choose one of {', '.join(map(str, get_args(hint)))}")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 
+import numpy as np
 import pytest
 
 from scgs_warp.config import presets as C
@@ -73,6 +74,15 @@ def test_values_as_people_write_them():
     ):
         with pytest.raises(UserError, match=f"; give {wanted}$"):
             C.with_field(config, name, C.parse_value(text), "--set")
+
+
+def test_values_as_scripts_compute_them():
+    given = {"motion": {"nodes": np.int64(64), "mask": np.bool_(True)}, "loss": {"arap": np.float32(0.5)}}
+    config = C.from_dict(given)
+    assert (type(config.motion.nodes), type(config.motion.mask), type(config.loss.arap)) == (int, bool, float)
+    assert C.whole_number(np.arange(3)[2], "steps") == 2 and json.dumps(C.to_dict(config))
+    with pytest.raises(UserError, match=r"motion\.nodes is array\(\[1, 2\]\); give a whole number"):
+        C.from_dict({"motion": {"nodes": np.array([1, 2])}})
 
 
 def test_a_file_that_begins_with_the_mark_of_windows(tmp_path):
