@@ -121,7 +121,7 @@ def rasterization(
     if rasterize_mode not in ("classic", "antialiased"):
         raise ValueError(f"rasterize_mode must be classic or antialiased, got {rasterize_mode!r}")
     planes = {"near_plane": near_plane, "far_plane": far_plane, "radius_clip": radius_clip, "eps2d": eps2d}
-    settings = {name: given_number(name, value) for name, value in planes.items()}
+    settings: dict[str, Any] = {name: given_number(name, value) for name, value in planes.items()}
     floats = {"means": means, "quats": quats, "scales": scales, "opacities": opacities, "colors": colors}
     _check_tensors(**floats, viewmats=viewmats, Ks=Ks, **({} if backgrounds is None else {"backgrounds": backgrounds}))
     _check_shapes(means, colors, viewmats, Ks, backgrounds, sh_degree)
