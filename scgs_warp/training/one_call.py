@@ -107,7 +107,7 @@ def configuration(preset: PresetName, steps: int | None, settings: dict[str, Any
     return check(config)
 
 
-def chosen_device(device: str) -> str:
+def chosen_device(device: Any) -> str:
     """Return ``cpu`` or ``cuda``.
 
     Raises:
@@ -115,6 +115,7 @@ def chosen_device(device: str) -> str:
     """
     import torch
 
+    device = str(device)  # a torch.device, as for Scene.load, too
     if device not in ("auto", "cpu", "cuda"):
         raise UserError(f"device is {device!r}; choose one of auto, cpu, cuda")
     available = torch.cuda.is_available() and environment.warp_finds_gpu()

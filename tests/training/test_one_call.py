@@ -12,6 +12,7 @@ import scgs_warp
 from helpers.tiny import tiny_config, tiny_dataset, write_dnerf
 from helpers.torch_settings import SETTINGS
 from scgs_warp.errors import UserError
+from scgs_warp.training.one_call import chosen_device
 
 TINY = {
     "steps": 60,
@@ -74,6 +75,10 @@ def test_mistakes_are_named_before_anything_is_written(arguments, expected, tmp_
     with pytest.raises(UserError, match=expected):
         scgs_warp.train(**{"data": tiny_dataset(2), "progress": False, **arguments})
     assert not (tmp_path / "runs").exists()
+
+
+def test_a_device_of_torch_is_a_device():
+    assert chosen_device(torch.device("cpu")) == "cpu"
 
 
 def test_a_film_of_impossible_size(tmp_path):
