@@ -269,6 +269,37 @@ def test_mouse_and_keys_move_the_view(browser, bar):
     visit.context.close()
 
 
+def test_controls_that_were_clicked_leave_keys_and_picture_to_the_page(browser, bar):
+    visit = Visit(browser, bar[1])
+    visit.still()
+    page, keys = visit.page, visit.page.keyboard
+    page.locator("#time").click()
+    begin = visit.state()["time"]
+    keys.press("ArrowRight")
+    keys.press("ArrowUp")
+    assert abs(visit.state()["time"] - begin - 0.02) < 1e-9, "hundredths of the motion, as beside the slider"
+    keys.press("h")
+    assert page.locator("#keys").is_visible()
+    keys.press("Escape")
+    assert page.locator("#keys").is_hidden()
+    page.get_by_role("button", name="Settings").click()
+    page.get_by_label("At the end").focus()
+    keys.press("b")
+    assert page.locator("#background").input_value() == "#000000", "a list has keys of its own"
+    keys.press("Escape")
+    assert page.locator("#settings").is_hidden()
+    assert page.evaluate("document.activeElement.id") == "more"
+    page.locator("#time").click()
+    keys.press(" ")
+    assert visit.state()["playing"]
+    for _ in range(2):
+        page.locator("#play").click()
+    page.mouse.move(320, 100)
+    until(lambda: page.evaluate("document.body.classList.contains('idle')"))
+    assert not visit.problems
+    visit.context.close()
+
+
 def test_panning_keeps_what_is_under_the_pointer(browser, bar):
     visit = Visit(browser, bar[1])
     visit.still()

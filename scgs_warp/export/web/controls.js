@@ -115,8 +115,10 @@ function listenToPanel(player, clock) {
 // While the scene plays and nobody does anything, the picture is all there is.
 function hideWhenIdle(clock) {
   let timer = 0;
+  // What a click or a finger has left behind, focus and hovering, keeps nothing open.
   const busy = () => !clock.playing || !element("settings").hidden || !element("keys").hidden
-    || element("controls").matches(":hover") || element("controls").contains(document.activeElement);
+    || (element("controls").matches(":hover") && matchMedia("(hover: hover)").matches)
+    || Boolean(element("controls").querySelector(":focus-visible"));
   const wake = () => {
     document.body.classList.remove("idle");
     clearTimeout(timer);
@@ -184,6 +186,23 @@ function listenToPointers(player) {
   }, { passive: false });
 }
 
+// The page's name of a key that was pressed; null: the control that has the focus uses it itself. The slider's own steps
+// are a thousandth of a second.
+function pageKey({ key, target }) {
+  const name = key.length === 1 ? key.toLowerCase() : key;
+  if (target.type === "range") return { ArrowUp: "ArrowRight", ArrowDown: "ArrowLeft" }[name] ?? (/^Page/.test(name) ? null : name);
+  const own = target.tagName === "SELECT" ? /^(?!Escape)/ : /^(INPUT|BUTTON)$/.test(target.tagName) ? /^( |Enter)$/ : null;
+  return own?.test(name) ? null : name;
+}
+
+function closeSheets() {
+  for (const [sheet, button] of [["settings", "more"], ["keys", "help"]]) {
+    if (element(sheet).hidden) continue;
+    if (element(sheet).contains(document.activeElement)) element(button).focus();
+    toggleSheet(sheet, button);
+  }
+}
+
 function listenToKeys(player, clock, further = {}) {
   const step = (by) => () => {
     clock.play(false);
@@ -198,16 +217,14 @@ function listenToKeys(player, clock, further = {}) {
   };
   const keys = {
     " ": () => clock.play(!clock.playing), ArrowLeft: step(-0.01), ArrowRight: step(0.01), Home: step(-1), End: step(1),
-    r: () => resetView(player), h: toggleHelp, "?": toggleHelp, f: toggleWhole,
+    Escape: closeSheets, r: () => resetView(player), h: toggleHelp, "?": toggleHelp, f: toggleWhole,
     c: () => followFilm(player, !player.follows),
     b: () => setBackground(player, player.background[0] < 0.5 ? [1, 1, 1] : [0, 0, 0]),
     ...further,
   };
   document.addEventListener("keydown", (event) => {
     if (event.ctrlKey || event.metaKey || event.altKey) return;
-    if (/^(select|input|button)$/i.test(event.target.tagName)) return; // they have keys of their own
-    const name = event.key.length === 1 ? event.key.toLowerCase() : event.key;
-    const view = (event.shiftKey && views["shift " + name]) || views[name];
+    const name = pageKey(event), view = (event.shiftKey && views["shift " + name]) || views[name];
     const act = view && (event.shiftKey || !keys[name]) ? view : keys[name];
     if (!act) return;
     event.preventDefault();
