@@ -211,6 +211,7 @@ def test_escape_and_the_button_take_back(browser, figure):
     visit.page.get_by_role("button", name="Settings").click()
     visit.page.get_by_role("button", name="Reset pose").click()
     assert not visit.ask("player.figure.posed") and visit.page.get_by_role("button", name="Reset pose").is_disabled()
+    assert float(visit.page.locator("#restore").evaluate("(one) => getComputedStyle(one).opacity")) < 1, "and looks so"
     visit.context.close()
 
 
