@@ -185,6 +185,34 @@ def test_a_key_follows_the_arrows_and_escape_leaves_it(browser, editor):
     window.close()
 
 
+def test_delete_takes_the_key_that_has_the_focus(browser, editor):
+    window = Window(browser, editor)
+    window.still()
+    page = window.page
+    window.ask("studio.link.ask('select', { what: 'nodes', nodes: [1, 2], how: 'replace' })")
+    for at in (0.0, 1.0, 2.0):
+        window.ask("studio.link.ask('put', { at: argument, translation: [0, 0, 0.1 * argument + 0.1] })", at)
+        window.ask("studio.link.ask('key', { at: argument })", at)
+    keys = page.locator("#tracks .lane:not(.ruler) .key")
+    until(lambda: keys.count() == 3)
+    moment = window.ask("player.time")
+    for place in (keys.nth(2), page.locator("#tracks .ruler")):
+        place.click(button="right")
+        assert window.ask("player.time === argument && !studio.timeline.chosen", moment), "another button means a menu"
+    keys.nth(1).focus()
+    page.keyboard.press("Delete")
+    until(lambda: keys.count() != 3)
+    assert [frame.at for frame in editor.session.edit.keyframes] == [0.0, 2.0]
+    until(lambda: page.evaluate("document.activeElement.its?.at") == 0.0)  # no way back through the whole page
+    page.keyboard.press("Enter")
+    page.keyboard.press("Escape")
+    assert window.ask("studio.timeline.chosen === null && studio.link.state.selection.length === 2")
+    page.locator("#view").focus()
+    page.keyboard.press("Delete")
+    until(lambda: not editor.session.edit.handles)
+    window.close()
+
+
 def test_the_scene_is_drawn_again_when_the_graphics_driver_comes_back(browser, editor):
     window = Window(browser, editor)
     window.still()

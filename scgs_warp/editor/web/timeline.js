@@ -10,15 +10,16 @@ class Timeline {
     this.owed = 0; // frames by which arrows still move it
     this.scrubbed = (event) => {
       if (event.type === "pointerdown") {
-        if (event.target.classList.contains("key")) return;
+        if (event.button !== 0 || event.target.classList.contains("key")) return; // a menu may swallow the release
         event.currentTarget.setPointerCapture(event.pointerId);
       } else if (!event.currentTarget.hasPointerCapture(event.pointerId)) return;
       clock.play(false);
       player.seek(this.share(event));
     };
     document.addEventListener("keydown", (event) => {
-      if (event.key !== "Escape" || !this.moving) return;
-      event.stopImmediatePropagation(); // it leaves what is chosen alone
+      if (event.key !== "Escape" || !(this.moving || this.chosen) || document.querySelector("dialog[open]")) return;
+      event.stopImmediatePropagation(); // it leaves what is chosen in the scene alone
+      if (!this.moving) this.chosen = null;
       this.stay();
     });
   }
@@ -83,11 +84,12 @@ class Timeline {
     this.tick();
   }
 
-  // A key keeps the focus when the lanes are drawn anew, also where arrows have moved it.
+  // A key keeps the focus when the lanes are drawn anew, also where it was moved. A removed one leaves it to the nearest.
   focus({ name, at }) {
-    const keys = [...this.place.querySelectorAll(".key")];
-    const same = keys.find(({ its }) => its.name === name && its.at === at);
-    (same ?? (this.keyed ? keys.find((key) => key.classList.contains("chosen")) : null))?.focus();
+    const lane = [...this.place.querySelectorAll(".key")].filter(({ its }) => its.name === name);
+    const away = ({ its }) => Math.abs(its.at - at), nearest = lane.sort((a, b) => away(a) - away(b))[0];
+    const moved = lane.find((key) => key.classList.contains("chosen"));
+    (nearest && away(nearest) === 0 ? nearest : moved ?? nearest)?.focus();
   }
 
   // Views of the film's camera, on a lane of their own.
@@ -142,10 +144,10 @@ class Timeline {
     button.its = its;
     button.classList.toggle("chosen", this.chosen?.name === name && this.chosen?.at === frame.at);
     button.addEventListener("pointerdown", (event) => {
+      if (event.button !== 0) return;
       event.stopPropagation();
       button.setPointerCapture(event.pointerId);
       this.moving = { its, from: event.clientX, copy: event.altKey };
-      this.keyed = false;
     });
     button.addEventListener("pointermove", (event) => {
       if (this.moving?.its !== its) return;
@@ -170,6 +172,7 @@ class Timeline {
     }
     button.addEventListener("keydown", (event) => {
       if (event.key === "Enter") this.choose(its);
+      if (event.key === "Delete" || event.key === "Backspace") this.chosen = its; // for the command, which follows
       if (event.key !== "ArrowLeft" && event.key !== "ArrowRight") return;
       event.preventDefault();
       this.nudge(its, event.key === "ArrowLeft" ? -1 : 1);
@@ -189,7 +192,7 @@ class Timeline {
   async nudge({ name, at }, frames) {
     this.owed += frames;
     if (this.nudging) return;
-    this.nudging = this.keyed = true;
+    this.nudging = true;
     while (this.owed) {
       const to = Math.max(0, at + this.owed / this.link.state.film.fps);
       this.owed = 0;
