@@ -213,6 +213,25 @@ def test_delete_takes_the_key_that_has_the_focus(browser, editor):
     window.close()
 
 
+def test_the_original_is_shown_no_longer_than_it_is_asked_for(browser, editor):
+    window = Window(browser, editor)
+    window.still()
+    page, keys = window.page, window.page.keyboard
+    page.locator("#view").focus()
+    keys.down("o")
+    assert window.ask("player.original") and "without the edit" in page.locator("#hint").inner_text()
+    page.evaluate("window.dispatchEvent(new Event('blur'))")  # the key is let go in another window
+    assert not window.ask("player.original")
+    keys.up("o")
+    for shown in (True, False):
+        keys.press("Control+k")
+        page.locator("#sought").fill("original")
+        keys.press("Enter")
+        assert window.ask("player.original") == shown, "from the palette, it is no key that is held"
+    assert "without the edit" not in page.locator("#hint").inner_text()
+    window.close()
+
+
 def test_the_scene_is_drawn_again_when_the_graphics_driver_comes_back(browser, editor):
     window = Window(browser, editor)
     window.still()

@@ -36,7 +36,7 @@ function commandTable(studio) {
     ["end", "Last frame", "End", () => player.seek(1)],
     ["camera", "Look through the film's camera", "c", () => followFilm(player, !player.follows)],
     ["view", "Add this view to the path of the film's camera", "v", () => ask("shot", { kind: "orbit", ...studio.view() })],
-    ["original", "Show the original while held", "o", () => studio.compare(true)],
+    ["original", "Show the original (O: while held)", "o", () => studio.compare(!player.original)],
     ["points", "Show control points", "p", () => studio.display("points", !tools.show.points)],
     ["ribbons", "Show trajectories", "t", () => studio.display("ribbons", !tools.show.ribbons)],
     ["black", "Black or white background", "b", () => studio.paint(player.background[0] < 0.5 ? [1, 1, 1] : [0, 0, 0])],
@@ -79,6 +79,7 @@ class Commands {
     }));
     document.addEventListener("keydown", (event) => this.press(event));
     document.addEventListener("keyup", (event) => event.key.toLowerCase() === "o" && studio.compare(false));
+    addEventListener("blur", () => studio.compare(false)); // a key that is let go in another window is not heard of
     element("sought").addEventListener("input", () => this.search());
     element("sought").addEventListener("keydown", (event) => this.walk(event));
   }
@@ -97,7 +98,7 @@ class Commands {
     if (!command) return;
     event.preventDefault();
     if (this.busy() && command.id !== "cancel") return; // the drag ends first
-    if (command.when() && !(event.repeat && command.id === "play")) command.run();
+    if (command.when() && !(event.repeat && /^(play|original|delete)$/.test(command.id))) command.run();
   }
 
   show() {

@@ -228,6 +228,7 @@ class Studio {
     if (Boolean(this.player.original) === on) return;
     this.player.original = on;
     this.player.changed();
+    element("hint").textContent = on ? "The scene without the edit; O shows the edit again." : HINTS[this.tools.kind];
   }
 
   paint(color) {
