@@ -232,6 +232,26 @@ def test_the_original_is_shown_no_longer_than_it_is_asked_for(browser, editor):
     window.close()
 
 
+def test_fields_show_the_edit_unless_something_is_being_typed(browser, editor):
+    window = Window(browser, editor)
+    window.still()
+    window.ask("studio.link.ask('select', { what: 'nodes', nodes: [1, 2], how: 'replace' })")
+    field = window.page.get_by_label("Move, x")
+    field.fill("0.5")
+    field.press("Enter")
+    until(lambda: window.ask("studio.link.state.target.translation[0]") == 0.5)
+    field.press("Control+z")
+    until(lambda: window.ask("studio.link.state.target.translation[0]") == 0)
+    assert field.input_value() == "0"
+    field.fill("7")
+    window.ask("studio.link.ask('tool', { rings: 3 })")
+    assert field.input_value() == "7"
+    field.fill("")
+    field.press("Tab")
+    assert field.input_value() == "0", "an empty field sets nothing"
+    window.close()
+
+
 def test_the_scene_is_drawn_again_when_the_graphics_driver_comes_back(browser, editor):
     window = Window(browser, editor)
     window.still()

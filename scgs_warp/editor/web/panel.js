@@ -17,6 +17,14 @@ class Panel {
     }
   }
 
+  // What is being typed into a field stays when the state changes; afterwards the field shows the state again.
+  watch(input) {
+    for (const [event, typed] of [["input", true], ["change", false], ["blur", false]]) {
+      input.addEventListener(event, () => { input.typed = typed; });
+    }
+    input.addEventListener("blur", () => this.show(this.state));
+  }
+
   make(row) {
     if (row.type === "buttons") {
       const line = document.createElement("div");
@@ -57,6 +65,7 @@ class Panel {
       input.replaceChildren(...options.map(([value, said]) => new Option(said, value)));
     };
     if (row.type === "choice" && Array.isArray(row.options)) fillOptions(row.options);
+    if (/^(number|color)$/.test(row.type)) this.watch(input);
     input.addEventListener("change", () => {
       const value = row.type === "checkbox" ? input.checked : row.type === "number" ? Number(input.value) : input.value;
       if (row.type === "number" && (input.value === "" || !input.checkValidity())) return input.reportValidity();
@@ -65,7 +74,7 @@ class Panel {
     this.controls.push((state) => {
       if (typeof row.options === "function") fillOptions(row.options(state));
       input.disabled = Boolean(row.when && !row.when(state));
-      if (document.activeElement === input && row.type !== "checkbox" && row.type !== "choice") return;
+      if (input.typed) return;
       const value = row.get(state);
       if (row.type === "checkbox") input.checked = Boolean(value);
       else if (input.value !== String(value)) input.value = row.type === "number" ? tidy(value) : value;
@@ -103,6 +112,7 @@ class Panel {
       input.type = "number";
       input.step = "any";
       input.setAttribute("aria-label", `${row.label}, ${axis}`);
+      this.watch(input);
       input.addEventListener("change", () => {
         if (input.value === "" || !input.checkValidity()) return;
         row.set(exact.map((value, k) => (inputs[k] === input ? Number(input.value) : value)));
@@ -114,7 +124,7 @@ class Panel {
       inputs.forEach((input, k) => {
         input.disabled = Boolean(row.when && !row.when(state));
         input.title = tidy(exact[k]);
-        if (document.activeElement !== input) input.value = Math.abs(exact[k]) < 1e-6 ? 0 : Number(Number(exact[k]).toPrecision(3));
+        if (!input.typed) input.value = Math.abs(exact[k]) < 1e-6 ? 0 : Number(Number(exact[k]).toPrecision(3));
       });
     });
     fields.append(...inputs);
@@ -123,6 +133,7 @@ class Panel {
   }
 
   show(state) {
+    this.state = state;
     for (const control of this.controls) control(state);
   }
 }
