@@ -232,6 +232,25 @@ def test_the_original_is_shown_no_longer_than_it_is_asked_for(browser, editor):
     window.close()
 
 
+def test_controls_that_have_the_focus_keep_their_own_keys_alone(browser, editor):
+    window = Window(browser, editor)
+    window.still()
+    page, keys = window.page, window.page.keyboard
+    loop = page.get_by_label("Loop")
+    loop.focus()
+    keys.press(" ")
+    assert not loop.is_checked() and not window.ask("clock.playing")
+    page.get_by_role("button", name="Add view").focus()
+    keys.press("ArrowRight")
+    assert window.ask("Math.round(player.at * player.fps)") == 1, "buttons need no arrows"
+    view = "[player.orbit.azimuth, player.orbit.elevation, player.orbit.distance]"
+    azimuth, elevation, distance = window.ask(view)
+    for key in ("ArrowRight", "ArrowRight", "ArrowDown", "PageDown"):
+        keys.press(f"Shift+{key}")
+    assert np.allclose(window.ask(view), [azimuth + 0.1, elevation - 0.05, distance / 0.9])
+    window.close()
+
+
 def test_fields_show_the_edit_unless_something_is_being_typed(browser, editor):
     window = Window(browser, editor)
     window.still()

@@ -7,6 +7,11 @@ function commandTable(studio) {
     clock.play(false);
     player.seek(player.time + by / Math.max(1, player.seconds * player.fps));
   };
+  const view = (change) => () => {
+    followFilm(player, false);
+    change(player.orbit);
+    player.changed();
+  };
   return [
     ["play", "Play or pause", " ", () => clock.play(!clock.playing)],
     ["key", "Key the pose here", "k", () => ask("key"), () => link.state?.handles.length > 0],
@@ -25,6 +30,12 @@ function commandTable(studio) {
     ["split", "Split the chosen control points off as a part", "", () => studio.changes.split(), () => chosen() && !link.state.part],
     ["hold", "Hold the selection as it is now", "h", () => ask("hold", { frame: studio.holdFrame }), chosen],
     ["frame", "Frame the scene", "f", () => studio.frame()],
+    ["left", "Turn the view to the left", "shift+ArrowLeft", view((orbit) => orbit.turn(-0.05, 0))],
+    ["right", "Turn the view to the right", "shift+ArrowRight", view((orbit) => orbit.turn(0.05, 0))],
+    ["up", "Turn the view up", "shift+ArrowUp", view((orbit) => orbit.turn(0, 0.05))],
+    ["down", "Turn the view down", "shift+ArrowDown", view((orbit) => orbit.turn(0, -0.05))],
+    ["nearer", "Bring the view nearer", "shift+PageUp", view((orbit) => orbit.zoom(0.9))],
+    ["farther", "Take the view farther away", "shift+PageDown", view((orbit) => orbit.zoom(1 / 0.9))],
     ["cancel", "Cancel, or choose nothing", "Escape", () => tools.cancel()],
     ["delete", "Delete the chosen key, else the handle", "Delete",
       () => (timeline.chosen ? timeline.remove() : ask("remove")), () => timeline.chosen || link.state?.active],
@@ -58,7 +69,8 @@ function showKeys() {
   element("keys").scrollTop = 0; // the button at its end has the focus
 }
 
-const KEY_NAMES = { " ": "Space", ArrowLeft: "\u2190", ArrowRight: "\u2192", Escape: "Esc" };
+const KEY_NAMES = { " ": "Space", ArrowLeft: "\u2190", ArrowRight: "\u2192", ArrowUp: "\u2191", ArrowDown: "\u2193",
+  PageUp: "Page up", PageDown: "Page down", Escape: "Esc" };
 const named = (part) => KEY_NAMES[part] ?? part[0].toUpperCase() + part.slice(1);
 const keyText = (key) => (key === "+" ? "+" : key.split("+").filter(Boolean).map(named).join("+"));
 
@@ -85,15 +97,14 @@ class Commands {
   }
 
   press(event) {
-    if (event.altKey || document.querySelector("dialog[open]")) return;
+    if (event.altKey || event.defaultPrevented || document.querySelector("dialog[open]")) return;
     const typed = /^(input|select|textarea)$/i.test(event.target.tagName) && event.target.type !== "checkbox"
       && !event.target.closest("dialog:not([open])"); // it keeps the focus until the next frame
-    const onButton = event.target.tagName === "BUTTON" && /^( |Enter|Arrow)/.test(event.key);
-    const onSummary = event.target.tagName === "SUMMARY" && /^( |Enter)/.test(event.key);
+    const pressed = /^( |Enter)$/.test(event.key) && event.target.matches("button, summary, [type=checkbox]");
     const control = event.ctrlKey || event.metaKey;
-    if ((typed && !(control && /[zyk]/i.test(event.key) && event.target.type !== "text")) || onButton || onSummary) return;
+    if ((typed && !(control && /[zyk]/i.test(event.key) && event.target.type !== "text")) || pressed) return;
     const name = event.key.length === 1 ? event.key.toLowerCase() : event.key;
-    const plain = (control ? "ctrl+" : "") + (event.shiftKey && control ? "shift+" : "") + name;
+    const plain = (control ? "ctrl+" : "") + (event.shiftKey && (control || /^(Arrow|Page)/.test(name)) ? "shift+" : "") + name;
     const command = this.list.find(({ key }) => key === plain || (key === "Delete" && plain === "Backspace"));
     if (!command) return;
     event.preventDefault();
