@@ -251,6 +251,23 @@ def test_controls_that_have_the_focus_keep_their_own_keys_alone(browser, editor)
     window.close()
 
 
+def test_what_is_pressed_while_the_film_plays_stays_where_it_is(browser, editor):
+    window = Window(browser, editor)
+    window.still()
+    place = window.part_on_screen(0)
+    window.page.mouse.move(*place)
+    window.ask("clock.play(true)")
+    window.page.mouse.down()
+    assert window.ask("player.tools.drag?.kind") == "pull"
+    pressed = window.ask("player.time")
+    window.page.evaluate("new Promise((done) => setTimeout(done, 300))")
+    assert window.ask("player.time") == pressed, "a click means what it was made on"
+    window.page.mouse.up()
+    until(lambda: window.ask("player.time") != pressed)
+    window.ask("clock.play(false)")
+    window.close()
+
+
 def test_fields_show_the_edit_unless_something_is_being_typed(browser, editor):
     window = Window(browser, editor)
     window.still()

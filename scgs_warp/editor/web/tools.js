@@ -99,6 +99,7 @@ class Tools {
     const { player } = this, spot = this.spot(event);
     const begin = (drag) => {
       player.canvas.setPointerCapture(event.pointerId);
+      player.clock.hold(true); // what was pressed is where it was
       this.drag = { pointer: event.pointerId, from: event, moved: false, ...drag };
       return true;
     };
@@ -132,7 +133,6 @@ class Tools {
     if (!drag.moved) {
       if (Math.hypot(event.clientX - drag.from.clientX, event.clientY - drag.from.clientY) <= CLICK) return;
       drag.moved = true;
-      player.clock.hold(true);
       if (drag.kind !== "pivot") this.grab(drag);
     }
     drag.latest = event;
