@@ -268,6 +268,33 @@ def test_what_is_pressed_while_the_film_plays_stays_where_it_is(browser, editor)
     window.close()
 
 
+def test_a_drag_that_is_cancelled_before_its_answer_ends_no_later_one(browser, editor):
+    window = Window(browser, editor)
+    window.still()
+    place, mouse = window.part_on_screen(0), window.page.mouse
+    window.ask(
+        """(() => { const { link } = studio, ask = link.ask.bind(link); let first = true;
+        link.ask = (what, ...rest) => { const answer = ask(what, ...rest); if (what !== "grab" || !first) return answer;
+          first = false; return new Promise((done) => { window.answer = () => done(answer); }); }; })()"""
+    )
+    mouse.move(*place)
+    mouse.down()
+    mouse.move(place[0] + 20, place[1], steps=3)
+    until(lambda: window.page.evaluate("Boolean(window.answer)"))
+    window.page.keyboard.press("Escape")
+    mouse.up()
+    mouse.move(*place)
+    mouse.down()
+    mouse.move(place[0], place[1] - 20, steps=3)
+    window.page.evaluate("window.answer()")
+    mouse.up()
+    window.still()
+    assert not editor.model.dragging and not window.ask("studio.link.state.undo"), "the first is taken back whole"
+    window.drag(window.part_on_screen(0), (0.0, -20.0))
+    until(lambda: window.ask("studio.link.state.undo"))
+    window.close()
+
+
 def test_fields_show_the_edit_unless_something_is_being_typed(browser, editor):
     window = Window(browser, editor)
     window.still()

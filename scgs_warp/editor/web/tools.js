@@ -95,7 +95,7 @@ class Tools {
 
   // Called for every press: true keeps it from turning the view.
   takes(event, fingers) {
-    if (this.drag || fingers || event.button !== 0 || !this.state || this.player.original || !this.link.open) return Boolean(this.drag);
+    if (this.drag || fingers || event.button !== 0 || !this.state || this.player.original || !this.link.open) return Boolean(this.drag && !this.drag.dropped);
     const { player } = this, spot = this.spot(event);
     const begin = (drag) => {
       player.canvas.setPointerCapture(event.pointerId);
@@ -149,12 +149,12 @@ class Tools {
       const row = this.owner[drag.node], chosen = this.kind === "points" && state.selection.includes(drag.node);
       if (!chosen && (this.kind === "points" || state.part !== this.parts[row].name)) {
         const answer = await this.link.ask("pick", this.picked(drag));
-        if (answer.problem) return this.stop();
+        if (answer.problem || drag.dropped) return this.stop();
       }
     }
     const answer = await this.link.ask("grab", { at });
-    if (answer.problem || this.drag !== drag) {
-      if (this.drag !== drag) this.link.ask("release", { at });
+    if (answer.problem || drag.dropped) {
+      if (!answer.problem) this.link.ask("cancel", { at });
       return this.stop();
     }
     drag.held = true;
@@ -224,11 +224,14 @@ class Tools {
   }
 
   cancel() {
-    if (!this.drag) {
+    const { drag } = this;
+    if (!drag) {
       this.link.ask("pick", { at: this.player.at, how: "replace" });
       return;
     }
-    if (this.drag.held) this.link.ask("cancel", { at: this.player.at });
+    drag.dropped = drag.moved && !drag.held && !drag.area && drag.kind !== "pivot";
+    if (drag.dropped) return; // until the server has taken hold: its answer would end a drag that began meanwhile
+    if (drag.held) this.link.ask("cancel", { at: this.player.at });
     this.stop();
   }
 
