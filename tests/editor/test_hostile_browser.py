@@ -295,6 +295,17 @@ def test_a_drag_that_is_cancelled_before_its_answer_ends_no_later_one(browser, e
     window.close()
 
 
+def test_downloads_are_offered_until_they_are_closed(browser, editor):
+    window = Window(browser, editor)
+    window.still()
+    window.ask("(window.setTimeout = (run) => run(), studio.offer('film.mp4', 'Film'))")  # no note is left in time
+    link = window.page.get_by_role("link", name="film.mp4")
+    assert link.count() == 1 and link.get_attribute("href") == "file/film.mp4"
+    window.page.get_by_role("button", name="Close this note").click()
+    assert link.count() == 0
+    window.close()
+
+
 def test_fields_show_the_edit_unless_something_is_being_typed(browser, editor):
     window = Window(browser, editor)
     window.still()

@@ -195,19 +195,27 @@ class Studio {
     this.post(row);
   }
 
-  post(row) {
+  post(row, stays = false) {
     element("notes").append(row);
     while (element("notes").children.length > 4) element("notes").firstChild.remove();
-    setTimeout(() => row.remove(), 9000);
+    if (!stays) {
+      setTimeout(() => row.remove(), 9000);
+      return;
+    }
+    const close = Object.assign(document.createElement("button"), { type: "button", textContent: "\u00d7", title: "Close this note" });
+    close.setAttribute("aria-label", "Close this note");
+    close.addEventListener("click", () => row.remove());
+    row.append(close);
   }
 
-  offer(file, job) {
+  // An export takes a while, and nobody may look at its end: it is offered until the note is closed.
+  offer(file, job, stays = true) {
     const row = document.createElement("li"), link = document.createElement("a");
     link.href = `file/${encodeURIComponent(file)}`;
     link.download = file;
     link.textContent = file;
     row.append(`${job} is done: `, link);
-    this.post(row);
+    this.post(row, stays);
   }
 
   use(kind) {
@@ -266,7 +274,7 @@ class Studio {
     const answer = await this.link.ask("save", { at: this.player.at, name: this.name });
     if (answer.name) {
       this.files = answer.files;
-      this.offer(answer.name, "The copy");
+      this.offer(answer.name, "The copy", false);
       this.panel.show(this.link.state);
     }
   }
