@@ -11,12 +11,22 @@ from .cache import ImageCache
 from .choice import check_choice
 from .dataset import Dataset
 from .images import ReadOptions, check_options
-from .readers import colmap, dnerf, nerfies, nerfstudio, panoptic, poses_bounds
+from .readers import (
+    actors_hq,
+    colmap,
+    dnerf,
+    easy_mocap,
+    nerfies,
+    nerfstudio,
+    panoptic,
+    poses_bounds,
+    rig_model,
+)
 from .unknown import no_layout, not_a_folder
 
 __all__ = ["Dataset", "ImageCache", "is_data_set", "load"]
 
-READERS = (dnerf, nerfstudio, nerfies, panoptic, poses_bounds, colmap)
+READERS = (dnerf, nerfstudio, nerfies, panoptic, rig_model, poses_bounds, easy_mocap, actors_hq, colmap)
 """Readers in the order in which they are tried: ``recognises(folder)``, then ``read(folder, split, options)``."""
 
 

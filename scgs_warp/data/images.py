@@ -66,8 +66,8 @@ def size_text(size: Sequence[float]) -> str:
 def is_reduced(size: tuple[int, int], full: tuple[int, int]) -> bool:
     """Return whether an image of this size is a reduced one of the full size: the proportions are kept up to the
     rounding to whole pixels."""
-    difference = abs(size[1] - size[0] * full[1] / full[0])
-    return size[0] * LEAST_REDUCTION <= full[0] and difference <= max(1.0, MAX_ASPECT_ERROR * size[1])
+    tolerance = max(1.0, MAX_ASPECT_ERROR * size[1])
+    return size[0] * LEAST_REDUCTION <= full[0] and abs(size[1] - size[0] * full[1] / full[0]) <= tolerance
 
 
 class Decoded(NamedTuple):

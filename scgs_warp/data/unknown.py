@@ -101,8 +101,9 @@ def no_layout(folder: Path, recognised: Callable[[Path], bool]) -> UserError:
         return not_a_folder(film)
     return UserError(
         f"{folder}: holds no known layout: no transforms_train.json (D-NeRF, Blender), transforms.json (nerfstudio), "
-        "dataset.json (HyperNeRF, NeRF-DS, DyCheck), train_meta.json (Panoptic), poses_bounds.npy (Neural 3D Video) or "
-        "sparse/0 (COLMAP); give the folder that holds one of these"
+        "dataset.json (HyperNeRF, NeRF-DS, DyCheck), train_meta.json (Panoptic), poses_bounds.npy (Neural 3D Video), "
+        "intri.yml (EasyMocap), calibration.csv (ActorsHQ) or sparse/0 (COLMAP); give the folder that holds one of "
+        "these"
     )
 
 

@@ -13,6 +13,7 @@ from fuzz.files_cases import Format, check_dataset, expect, finite, suffixed, wi
 from helpers.layouts import write_colmap, write_nerfies, write_panoptic, write_poses_bounds
 from helpers.nerfstudio_files import HEIGHT, WIDTH, viewmat
 from helpers.nerfstudio_files import write as write_nerfstudio_plain
+from helpers.rig_layouts import write_actors_hq, write_easymocap, write_instants, write_multipleview
 from helpers.tiny import write_dnerf
 from scgs_warp.data import load
 from scgs_warp.data.camera_path import read_camera_path
@@ -161,6 +162,10 @@ FORMATS = (
     Format("panoptic", lambda folder: write_panoptic(folder, 3, 3), load_train, NOT_PICTURES),
     Format("camera_path", write_paths, load_paths),
     Format("poses_bounds", lambda folder: write_poses_bounds(folder, 3, 2), load_train),
+    Format("multipleview", write_multipleview, load_train, NOT_PICTURES, share=0.5),
+    Format("instants", write_instants, load_train, NOT_PICTURES, share=0.5),
+    Format("easymocap", write_easymocap, load_train, suffixed(".yml")),
+    Format("actors_hq", write_actors_hq, load_train, suffixed(".csv")),
     Format("colmap-binary", lambda folder: write_colmap(folder, 6), load_train, NOT_PICTURES),
     Format("colmap-text", lambda folder: write_colmap(folder, 6, "OPENCV", True), load_train, NOT_PICTURES),
     Format("ground-truth", write_truth, load_truth),

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path, PurePosixPath
 
-from ...errors import UserError
+from ...errors import UserError, shell_words
 from ..assemble import FrameRecord, assemble, video_border, with_points
 from ..choice import choose
 from ..dataset import Dataset
@@ -22,6 +22,7 @@ from ..name_times import times_from_names
 from ..natural_order import natural
 from .colmap_images import ImageFiles, find_images
 from .colmap_model import ModelCamera, ModelImage, find_model, read_model
+from .rig_model import is_instant
 
 MADE_FROM = "give the images that the model was made from, with their names"
 """What to do about missing images."""
@@ -37,7 +38,7 @@ def read(folder: Path, split: str, options: ReadOptions) -> Dataset:
 
     A model has no times; they are those in the images' names (:func:`moments_in_names`). Images that COLMAP did not
     register then leave a gap, and cameras with equally numbered files share times. If the names tell none, the images
-    are evenly spaced in their order.
+    are evenly spaced in their order. The images of one instant of a rig (``rig_model``) have time 0.
 
     Raises:
         UserError: the data is invalid; one line names the file, the field and the remedy.
@@ -49,7 +50,8 @@ def read(folder: Path, split: str, options: ReadOptions) -> Dataset:
     found = find_images(folder, model_folder, [image.name for image in images])
     files = found.files
     lenses = [partial(_lens, model_folder, image, model.cameras[image.camera]) for image in images]
-    times = times_from_names([image.name for image in images])
+    instant = is_instant(folder)
+    times = [0.0] * len(images) if instant else times_from_names([image.name for image in images])
     choice = choose(model_folder, files, times, options, _cameras(images), MADE_FROM)
     sizes = _check_sizes([files[index] for index in choice.indices], [lenses[index] for index in choice.indices])
     stated = [model.cameras[images[index].camera] for index in choice.indices]
@@ -69,6 +71,8 @@ def read(folder: Path, split: str, options: ReadOptions) -> Dataset:
     ]
     border = video_border([files[index] for index in choice.indices], [times[index] for index in choice.indices])
     notes = [*choice.notes, *found.notes, *smaller, *([] if offset is None else [note(offset)])]
+    if instant:
+        notes.append(f"{folder}: holds one instant of a rig; give --data {shell_words(folder.parent)} for all instants")
     data = assemble(records, options, folder=folder, split=split, border=border, notes=notes)
     points = model.points if offset is None else model.points - offset
     return with_points(data, points, model.colors) if len(points) else data

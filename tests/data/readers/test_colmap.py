@@ -178,6 +178,7 @@ FAULTS = {
     "model": (model_text("cameras.txt", words(0, 1, "PLATE")), "camera '7' is of no model that is known"),
     "params": (model_text("cameras.txt", words(0, 1, "OPENCV")), "camera '7' has 4 parameters, but OPENCV"),
     "focal": (model_text("cameras.txt", words(0, 4, "-3")), "the focal length is not positive"),
+    "no size": (model_text("cameras.txt", words(0, 2, "0")), "is of 0 x 60 pixels, but the image is 80 x 60"),
     "size": (model_text("cameras.txt", words(0, 2, "81")), "is of 81 x 60 pixels, but the image is 80 x 60"),
     "binary": (lambda folder: (folder / "sparse/0/images.txt").write_bytes(b"\xff\xfe\x80"), "truncated or damaged"),
     "points": (model_text("points3D.txt", words(0, 2, "far")), "points3D.txt: truncated or damaged"),
