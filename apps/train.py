@@ -35,8 +35,8 @@ class RunFolders:
     """Folders of a run."""
 
     data: Path | None = None
-    """Folder of a data set: D-NeRF, nerfstudio, HyperNeRF, NeRF-DS, DyCheck, Panoptic, Neural 3D Video or COLMAP
-    (docs/data.md). By default the built-in scene, which is made on first use."""
+    """Folder of a data set: D-NeRF, nerfstudio, HyperNeRF, NeRF-DS, DyCheck, Panoptic, Neural 3D Video, EasyMocap,
+    ActorsHQ, COLMAP and others (docs/data.md). By default the built-in scene, which is made on first use."""
     output: Path | None = None
     """Run folder; runs/NAME-PRESET by default."""
 

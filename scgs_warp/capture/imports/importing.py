@@ -23,7 +23,7 @@ from ...storage.output_folders import paths_in
 from ...visualization.video import write_png
 from ..similarity import Similarity, upright
 from ..source import read_rgb
-from . import agreement, arrays, frame_folders, monst3r, phone_apps, pi3, stray_scanner
+from . import agreement, arrays, frame_folders, monst3r, phone_apps, pi3, stray_scanner, vipe
 from .archives import ShowProgress, unpacked
 from .depth_writing import DepthWriter, checked_depth, known_depth
 from .scene import MAX_NUMBER, OPENGL_TO_OPENCV, ImportedFrame, ImportedScene
@@ -60,6 +60,8 @@ def read_scene(path: Path) -> ImportedScene:
     """
     if not path.exists():
         raise UserError(f"--poses {path}: no such file or folder; give what the other program exported")
+    if vipe.is_vipe(path):
+        return vipe.read_vipe(path)
     if pi3.recognises(path):
         return pi3.read(path)
     if arrays.recognises(path):
@@ -76,8 +78,8 @@ def read_scene(path: Path) -> ImportedScene:
             raise UserError(f"--poses {path}: is in nerfstudio's layout already; python apps/train.py --data {path}")
     raise UserError(
         f"--poses {path}: is no scene of MegaSaM, VGGT, Depth Anything 3 or Pi3 (.npz), MonST3R "
-        f"({monst3r.TRAJECTORY}), CUT3R (camera, color), DA3-Streaming ({frame_folders.POSES}), Polycam (keyframes), "
-        f"Record3D (.r3d; metadata.json, rgb), 3D Scanner App (frame_00000.json) or Stray Scanner "
+        f"({monst3r.TRAJECTORY}), ViPE (pose, rgb), CUT3R (camera, color), DA3-Streaming ({frame_folders.POSES}), "
+        f"Polycam (keyframes), Record3D (.r3d; metadata.json, rgb), 3D Scanner App (frame_00000.json) or Stray Scanner "
         f"({stray_scanner.TRACK}); export one of these"
     )
 

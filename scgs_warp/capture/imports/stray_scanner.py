@@ -8,7 +8,6 @@ cx, cy``; ``camera_matrix.csv``, the nine numbers of K; ``depth/000000.png`` in 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +15,7 @@ import numpy as np
 from ...errors import UserError
 from ...storage.files import read_text
 from ..source import Video
-from ..source_frame import SourceFrame
+from .film_pictures import MOST_FRAMES, FilmPictures
 from .monst3r import MAX_TEXT_BYTES, quaternion_matrix
 from .phone_apps import depth_of
 from .scene import Y_UP_TO_Z_UP, ImportedFrame, ImportedScene, intrinsics, rigid
@@ -24,10 +23,6 @@ from .scene import Y_UP_TO_Z_UP, ImportedFrame, ImportedScene, intrinsics, rigid
 FILM, TRACK, LENS = "rgb.mp4", "odometry.csv", "camera_matrix.csv"
 POSE = ("timestamp", "frame", "x", "y", "z", "qx", "qy", "qz", "qw")
 INTRINSICS = ("fx", "fy", "cx", "cy")
-MOST_FRAMES = 600
-"""Largest number of frames that are taken, evenly spaced: the app records 60 in a second."""
-LARGEST = 1 << 16
-"""Longer side of a picture up to which it is not reduced."""
 
 
 def is_stray(path: Path) -> bool:
@@ -48,7 +43,7 @@ def read_stray(path: Path) -> ImportedScene:
         raise UserError(f"{path / TRACK}: frame does not rise from row to row; export the recording again")
     filmed = int((numbers < film.count).sum())
     rows = range(0, filmed, -(-max(filmed, 1) // MOST_FRAMES))
-    pictures = _Pictures(film, [int(numbers[row]) for row in rows])
+    pictures = FilmPictures(film, [int(numbers[row]) for row in rows])
     frames = []
     for row in rows:
         where, number = f"{path / TRACK}: row {row}", int(numbers[row])
@@ -103,26 +98,3 @@ def _lens(path: Path, columns: dict[str, np.ndarray], row: int) -> np.ndarray:
         return intrinsics(np.array([float(word) for word in words]).reshape(3, 3), str(path / LENS))
     except (OSError, ValueError):
         raise UserError(f"{path / LENS}: holds no nine numbers; export the recording again") from None
-
-
-class _Pictures:
-    """Pictures of a film by their number; asked for in ascending order, the film is decoded once."""
-
-    def __init__(self, film: Video, wanted: list[int]) -> None:
-        self._film, self._wanted = film, frozenset(wanted)
-        self._frames: Iterator[SourceFrame] | None = None
-        self._last: SourceFrame | None = None
-
-    def at(self, number: int) -> np.ndarray:
-        """Return a picture [H, W, 3] uint8 RGB.
-
-        Raises:
-            UserError: the film ends before it.
-        """
-        if self._frames is None or self._last is None or number < self._last.index:
-            self._frames, self._last = self._film.frames(LARGEST, self._wanted), None
-        while self._last is None or self._last.index < number:
-            self._last = next(self._frames, None)
-            if self._last is None:
-                raise UserError(f"{self._film.path}: ends before frame {number}; export the recording again")
-        return self._last.image
