@@ -13,6 +13,7 @@ import re
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
@@ -33,6 +34,8 @@ from .transforms import SUFFIXES
 
 FILE = "poses_bounds.npy"
 VIDEOS = (".mp4", ".mov", ".avi", ".mkv")
+MANY = "mv_images"
+"""Folder of the images of all cameras of an instant, beside the film that takes one of them."""
 HELD_OUT_CAMERA = 0
 """Index of the held-out camera among the chosen ones: the central one of Neural 3D Video, as in published results."""
 POINTS = ("points3D.ply", "points3D_downsample2.ply", "points3d.ply")
@@ -52,7 +55,7 @@ def recognises(folder: Path) -> bool:
 
 def read(folder: Path, split: str, options: ReadOptions) -> Dataset:
     """Read one split: the first of the chosen cameras is ``test`` and ``val``, the others are ``train``. Of the film of
-    one camera, every eighth image is held out.
+    one camera, the views of the other cameras are held out or, without these, every eighth image.
 
     All cameras share the same times, which are evenly spaced in the order of the images' names.
 
@@ -105,24 +108,55 @@ def _film(folder: Path, count: int) -> list[Path]:
 
 
 def _read_film(folder: Path, files: list[Path], rows: np.ndarray, split: str, options: ReadOptions) -> Dataset:
-    """Read a film of one camera: every eighth image is held out; times are evenly spaced in the order of names."""
+    """Read a film of one camera: the views of the other cameras are held out or, without these, every eighth image.
+    Times are evenly spaced in the order of names."""
     path, ranks = folder / FILE, {index: rank for rank, index in enumerate(by_name(files))}
     times = [ranks[index] / (len(files) - 1) for index in range(len(files))]
     choice = choose(path, files, times, options, ["images"] * len(files))
     order = sorted(choice.indices, key=lambda index: times[index])
-    records = [
-        FrameRecord(
-            files[index],
-            row_viewmat(path, index, rows[index, :15].reshape(3, 5)),
-            choice.times[index],
-            partial(row_lens, path, index, rows[index, :15].reshape(3, 5)[:, 4]),
-            files[index].stem,
-        )
-        for index in held_out(path, order, split)
-    ]
+
+    def record(file: Path, camera: int, index: int, name: str) -> FrameRecord:
+        pose = rows[camera, :15].reshape(3, 5)
+        lens = partial(row_lens, path, camera, pose[:, 4])
+        return FrameRecord(file, row_viewmat(path, camera, pose), choice.times[index], lens, name)
+
+    views = _other_views(folder, len(files))
+    if views and split != "train":
+        of_instants = [view for view in views if view.index in choice.indices]
+        records = [record(view.file, view.camera, view.index, view.name) for view in of_instants]
+    else:
+        chosen = choice.indices if views else held_out(path, order, split)
+        records = [record(files[index], index, index, files[index].stem) for index in chosen]
     data = assemble(records, options, folder=folder, split=split, notes=choice.notes)
     data.bounds = _bounds(rows[choice.indices, 15:])
     return data
+
+
+class _View(NamedTuple):
+    """An image of the instant of image ``index`` by a camera that filmed another one."""
+
+    file: Path
+    camera: int
+    """Row of the camera."""
+    index: int
+    name: str
+
+
+def _other_views(folder: Path, count: int) -> list[_View]:
+    """Return the images of the data of Yoon et al. by which Neural Scene Flow Fields is scored: of twelve cameras that
+    stand, which the film takes in turn, those that it does not take at an instant; none if ``mv_images`` does not hold
+    them all."""
+    shown = {file.stem: file for file in _files(folder / MANY / "00000")} if (folder / MANY / "00000").is_dir() else {}
+    names = [f"cam{camera + 1:02d}" for camera in range(len(shown))]
+    if not 2 <= len(shown) <= count or set(shown) != set(names):
+        return []
+    views = [
+        _View(folder / MANY / f"{index:05d}" / shown[name].name, camera, index, f"{index:05d}_{name}")
+        for index in range(count)
+        for camera, name in enumerate(names)
+        if index % len(names) != camera
+    ]
+    return views if all(view.file.is_file() for view in views) else []
 
 
 def _bounds(depths: np.ndarray) -> tuple[float, float] | None:

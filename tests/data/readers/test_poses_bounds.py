@@ -13,6 +13,7 @@ from helpers.layouts import (
     FOCAL,
     HEIGHT,
     WIDTH,
+    save_image,
     share_found,
     viewmat,
     write_colmap,
@@ -157,6 +158,37 @@ def test_a_film_of_one_camera(tmp_path, name):
     assert share_found(train) > FOUND and share_found(test) > FOUND
     assert [frame.name for frame in test] == [names[4]] and len(train) == 11
     assert {frame.name: round(frame.time * 11) for frame in train}[names[10]] == 10 and train.bounds == (1.0, 9.0)
+
+
+def write_nsff(folder: Path, cameras: int = 4, instants: int = 6) -> None:
+    """The data of Yoon et al. for Neural Scene Flow Fields: the film takes the cameras, which stand, in turn."""
+    write_poses_bounds(folder, cameras=cameras, instants=1)
+    shown = [
+        (folder / f"cam{camera:02d}/images/0000.png").rename(folder / f"{camera}.png") for camera in range(cameras)
+    ]
+    for camera in range(cameras):
+        (folder / f"cam{camera:02d}/images").rmdir()
+        (folder / f"cam{camera:02d}").rmdir()
+    for instant in range(instants):
+        for camera, file in enumerate(shown):
+            save_image(folder / f"mv_images/{instant:05d}/cam{camera + 1:02d}.png", cv2.imread(str(file)))
+        save_image(folder / f"images/{instant:05d}.png", cv2.imread(str(shown[instant % cameras])))
+        save_image(folder / f"motion_masks/{instant:05d}.png", np.zeros((HEIGHT, WIDTH), np.uint8))
+    for file in shown:
+        file.unlink()
+    rows = np.load(folder / "poses_bounds.npy")
+    np.save(folder / "poses_bounds.npy", rows[np.arange(instants) % cameras])
+
+
+def test_views_of_the_other_cameras_are_held_out(tmp_path):
+    write_nsff(tmp_path)
+    train, test = load(tmp_path), load(tmp_path, "test")
+    assert share_found(train) > FOUND and share_found(test) > FOUND
+    assert len(train) == 6 and len(test) == 6 * 3 and sorted(set(test.times.tolist())) == train.times.tolist()
+    assert [frame.name for frame in test.entries[:4]] == ["00000_cam02", "00000_cam03", "00000_cam04", "00001_cam01"]
+    assert len(load(tmp_path, "test", frames="2:4")) == 2 * 3
+    (tmp_path / "mv_images/00003/cam02.png").unlink()
+    assert len(load(tmp_path, "test")) == 1, "every eighth, where views are missing"
 
 
 def test_images_of_all_cameras_in_one_folder(tmp_path):
