@@ -2,7 +2,7 @@
 
 ``camera_angle_x`` (horizontal field of view, radians) or ``fl_x, fl_y, cx, cy, w, h`` (pixels); per frame
 ``file_path``, ``transform_matrix`` (camera-to-world, OpenGL: x right, y up, z backward), ``time`` in [0, 1] and, if the
-frame has one, ``mask_path`` (black: not valid).
+frame has one, ``mask_path`` (black: not valid). ``points3d.ply``: initial points, if the images are filled.
 Layout: Pumarola et al., D-NeRF, CVPR 2021, and NeRF's Blender scenes.
 """
 
@@ -14,14 +14,17 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from ...errors import UserError
 from ...storage.json_files import read_json
-from ..assemble import FrameRecord, assemble
+from ..assemble import FrameRecord, assemble, with_points
 from ..choice import Choice, choose, choose_instants, of_cameras, present
 from ..dataset import Dataset
 from ..held_out import held_out
 from ..images import ReadOptions
 from ..moved_images import parts_of
+from ..points import read_points
 from .transforms import (
     Times,
     find_mask,
@@ -33,6 +36,11 @@ from .transforms import (
     read_transforms,
 )
 from .transforms_images import find_images
+
+POINTS = "points3d.ply"
+"""Points of films of rigs that are converted to this layout."""
+LEAST_COLOR = 0.02
+"""Largest difference of random points' colours."""
 
 
 def transforms_path(folder: Path, split: str) -> Path:
@@ -82,7 +90,17 @@ def read(folder: Path, split: str, options: ReadOptions) -> Dataset:
         mask = find_mask(path, folder, index, entries[index])
         frame = (files[index], poses[index], choice.times[index], lens, files[index].stem, mask)
         records.append(FrameRecord(*frame, states_size=states_size))
-    return assemble(records, options, folder=folder, split=split, one_size=True, notes=notes)
+    data = assemble(records, options, folder=folder, split=split, one_size=True, notes=notes)
+    return data if data.with_alpha else with_points(data, *_points(folder / POINTS))
+
+
+def _points(path: Path) -> tuple[np.ndarray | None, np.ndarray | None]:
+    """Read points [P, 3] and their colours [P, 3]; None for both without a file, and if all are of one grey: programs
+    leave random points of this kind there."""
+    if not path.is_file():
+        return None, None
+    points, colors = read_points(path)
+    return (None, None) if colors is None or not len(colors) or np.ptp(colors) < LEAST_COLOR else (points, colors)
 
 
 def _path(folder: Path, split: str) -> tuple[Path, bool]:

@@ -14,6 +14,7 @@ from PIL import Image as PillowImage
 
 from helpers.dnerf_files import HEIGHT, HUGE, IDENTITY, WIDTH, edit, write_scene
 from scgs_warp.data import load
+from scgs_warp.data.points import write_points
 from scgs_warp.errors import UserError
 from scgs_warp.geometry.normalisation import Normalisation
 
@@ -285,3 +286,19 @@ def test_jumpingjacks(data_root):
     assert all(frame.image[90:110, 90:110].mean() > 0.02 for frame in data)
     transform = Normalisation.fit(data.cameras)
     assert np.abs(transform.centre).max() < 1e-4 and transform.scale == pytest.approx(1.0, abs=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("mode", "varied", "taken"), [("RGB", True, True), ("RGB", False, False), ("RGBA", True, False)]
+)
+def test_points_of_filled_images(tmp_path, mode, varied, taken):
+    """4DGS's converter of Neural 3D Video writes points; 3DGS leaves random ones, all of one grey, under this name."""
+    write_scene(tmp_path, mode=mode)
+    places = np.random.default_rng(1).uniform(-1.3, 1.3, (50, 3))
+    colors = np.random.default_rng(2).integers(0, 256, (50, 3)) if varied else np.full((50, 3), 127)
+    write_points(tmp_path / "points3d.ply", places, colors.astype(np.uint8))
+    data = load(tmp_path)
+    assert (data.points is not None) == taken
+    if taken:
+        np.testing.assert_allclose(data.points, places, atol=1e-6)
+        np.testing.assert_allclose(data.colors, colors / 255.0, atol=1e-6)
