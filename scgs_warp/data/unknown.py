@@ -8,6 +8,8 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from ..errors import UserError, shell_words
+from ..storage.files import open_regular
+from .images import INSPECTED
 from .readers.transforms import SUFFIXES as IMAGES
 
 FILMS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".mts", ".m2ts", ".3gp", ".wmv")
@@ -19,6 +21,20 @@ DEEPEST, MOST_FOLDERS = 3, 200
 FEWEST_PHOTOS = 3
 RECORD3D = (("metadata.json", "rgb"), ("metadata", "rgbd"))
 """Files and folders by which an export of Record3D is recognised."""
+FOREIGN = (
+    (("annots.npy",), "the cameras of ZJU-MoCap are a pickle, which can run programs", "EasyMocap", ""),
+    (("rgb.txt", "rgb"), "the poses of TUM RGB-D are not read", "", "{folder}/rgb"),
+    (("color", "pose"), "the poses of ScanNet are not read", "", "{folder}/color"),
+    (("models.json",), "the cameras of Google's Immersive are not read", "", "--rig {folder}"),
+)
+"""Data sets that are not read: their files and folders, what is to be said, and the layout in which the cameras may be
+written, or what ``capture`` is to be given, which finds them anew."""
+SIGNS = (
+    (b"<chunk", "Metashape", "ns-process-data metashape"),
+    (b"#name,", "RealityCapture", "ns-process-data realitycapture"),
+    (b"# Bundle file", "Bundler", "colmap model_converter"),
+)
+"""What the files of programs' cameras begin with, the programs, and what makes a layout of them that is read."""
 
 
 def not_a_folder(path: Path) -> UserError:
@@ -88,6 +104,9 @@ def no_layout(folder: Path, recognised: Callable[[Path], bool]) -> UserError:
             f"{folder}: is an export of {program}; make a data set of it: scgs-warp capture --poses "
             f"{shell_words(folder)} --output {shell_words(f'data/{folder.resolve().name}')}"
         )
+    foreign = _foreign(folder, entries)
+    if foreign is not None:
+        return UserError(foreign)
     renamed = next((entry for entry in entries if entry.match("transform*.json") and entry.is_file()), None)
     if renamed is not None:
         return UserError(f"{renamed}: is read under another name; call it transforms.json if it lists frames and poses")
@@ -107,6 +126,31 @@ def no_layout(folder: Path, recognised: Callable[[Path], bool]) -> UserError:
     )
 
 
+def _foreign(folder: Path, entries: list[Path]) -> str | None:
+    """Return the message about data of other programs that are not read; None for other folders."""
+    for names, what, layout, given in FOREIGN:
+        if all((folder / name).exists() for name in names):
+            remedy = f"write them in the layout of {layout} (docs/data.md)"
+            if given:
+                output = shell_words(f"data/{folder.resolve().name}")
+                remedy = f"find them: scgs-warp capture {given.format(folder=shell_words(folder))} --output {output}"
+            return f"{folder / names[0]}: {what}; {remedy}"
+    for entry in entries:
+        if entry.suffix.lower() in (".xml", ".csv", ".out") and entry.is_file():
+            try:
+                with open_regular(entry) as file:
+                    start = file.read(INSPECTED)
+            except OSError:
+                continue
+            for sign, program, command in SIGNS:
+                if sign in start:
+                    return (
+                        f"{entry}: cameras of {program} are not read; export them from there for COLMAP, or convert "
+                        f"them: {command}"
+                    )
+    return None
+
+
 def _exported_by(folder: Path) -> str | None:
     """Name the program whose export ``capture --poses`` reads; None for other folders."""
     if (folder / "keyframes").is_dir():
@@ -120,6 +164,8 @@ def _exported_by(folder: Path) -> str | None:
         return "Stray Scanner"
     if (folder / "color").is_dir() and any((folder / "camera").glob("*.npz")):
         return "CUT3R"
+    if any((folder / "pose").glob("*.npz")) and any((folder / "rgb").glob("*.mp4")):
+        return "ViPE"
     if (folder / "camera_poses.txt").is_file() and (folder / "results_output").is_dir():
         return "DA3-Streaming"
     return "MonST3R" if (folder / "pred_traj.txt").is_file() else None

@@ -97,6 +97,7 @@ def test_a_file_of_cameras_under_another_name(tmp_path):
         (["odometry.csv", "rgb.mp4", "depth/000000.png"], "Stray Scanner"),
         (["camera/000000.npz", "color/000000.png"], "CUT3R"),
         (["camera_poses.txt", "results_output/frame_0.npz"], "DA3-Streaming"),
+        (["pose/film.npz", "rgb/film.mp4", "intrinsics/film.npz"], "ViPE"),
     ],
 )
 def test_exports_that_capture_reads(tmp_path, files, program):
@@ -105,3 +106,37 @@ def test_exports_that_capture_reads(tmp_path, files, program):
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_bytes(b"")
     assert f"is an export of {program}; make a data set of it: scgs-warp capture --poses {tmp_path}" in said(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("files", "expected"),
+    [
+        (
+            ["annots.npy", "Camera_B1/000000.jpg"],
+            "a pickle, which can run programs; write them in the layout of EasyMocap",
+        ),
+        (["rgb.txt", "groundtruth.txt", "rgb/1.5.png"], "find them: scgs-warp capture {path}/rgb --output data/"),
+        (["color/0.jpg", "pose/0.txt", "depth/0.png"], "find them: scgs-warp capture {path}/color --output data/"),
+        (["models.json", "camera_0001.mp4"], "find them: scgs-warp capture --rig {path} --output data/"),
+    ],
+)
+def test_data_sets_that_are_not_read(tmp_path, files, expected):
+    """They are answered with a way to go on."""
+    for name in files:
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_bytes(b"")
+    assert expected.format(path=tmp_path) in said(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("name", "start", "command"),
+    [
+        ("cameras.xml", '<?xml version="1.0"?>\n<document version="2.0.0">\n  <chunk label="a"', "metashape"),
+        ("cameras.csv", "#name,x,y,alt,heading,pitch,roll,f,px,py,k1,k2,k3,k4,t1,t2\n", "realitycapture"),
+        ("scene.out", "# Bundle file v0.3\n2 9\n", "model_converter"),
+    ],
+)
+def test_cameras_of_other_programs(tmp_path, name, start, command):
+    (tmp_path / "a.csv").write_text("x,y\n")
+    (tmp_path / name).write_text(start)
+    assert command in said(tmp_path) and "export them from there for COLMAP" in said(tmp_path)
