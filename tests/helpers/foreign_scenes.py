@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import json
+import zipfile
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import av
 import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -230,12 +232,38 @@ def write_scanner(folder: Path) -> Path:
     return folder
 
 
+def write_vipe(folder: Path, name: str = "film", camera: str = "PINHOLE", unposed: int | None = None) -> Path:
+    """With the record of a run, a pickle, which is never read."""
+    made, posed = wall(), [number for number in range(COUNT) if number != unposed]
+    for kind in ("rgb", "pose", "intrinsics", "depth", "vipe"):
+        (folder / kind).mkdir(parents=True, exist_ok=True)
+    with av.open(str(folder / f"rgb/{name}.mp4"), "w") as out:
+        stream = out.add_stream("libx264rgb", rate=24, options={"crf": "0"})
+        stream.width, stream.height, stream.pix_fmt = made.images.shape[2], made.images.shape[1], "rgb24"
+        for image in made.images:
+            out.mux(stream.encode(av.VideoFrame.from_ndarray(image, "rgb24")))
+        out.mux(stream.encode())
+    poses = np.linalg.inv(made.viewmats).astype(np.float32)
+    np.savez(folder / f"pose/{name}.npz", data=poses[posed], inds=np.array(posed))
+    lens = np.tile(np.float32(K[[0, 1, 0, 1], [0, 1, 2, 2]]), (COUNT, 1))
+    np.savez(folder / f"intrinsics/{name}.npz", data=lens, inds=np.arange(COUNT))
+    (folder / f"intrinsics/{name}_camera.txt").write_text("".join(f"{i}: {camera}\n" for i in range(COUNT)))
+    (folder / f"vipe/{name}_info.pkl").write_bytes(b"\x80\x04.")
+    with zipfile.ZipFile(folder / f"depth/{name}.zip", "w", zipfile.ZIP_DEFLATED) as archive:
+        for number in range(COUNT):
+            write_exr(folder / "map.exr", {"Z": made.depths[number].astype(np.float16)})
+            if (folder / "map.exr").is_file():
+                archive.write(folder / "map.exr", f"{number:05d}.exr")
+    return folder
+
+
 WRITERS = {
     "MegaSaM": write_megasam,
     "VGGT": write_vggt,
     "Depth Anything 3": write_depth_anything,
     "Pi3": write_pi3,
     "MonST3R": write_monst3r,
+    "ViPE": write_vipe,
     "CUT3R": write_cut3r,
     "DA3-Streaming": write_streaming,
     "Polycam": write_polycam,

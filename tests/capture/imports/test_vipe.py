@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import zipfile
-from pathlib import Path
+from functools import partial
 
-import av
 import numpy as np
 import pytest
 import torch
 
-from helpers.foreign_scenes import COUNT, K, wall, write_exr
+from helpers.foreign_scenes import COUNT, K, wall, write_vipe
 from helpers.importing import entries, refused, silent
 from scgs_warp.capture import import_scene
 from scgs_warp.capture.imports import vipe
@@ -20,31 +18,7 @@ from scgs_warp.storage.exr_files import INSTALL, reads_exr
 UNPOSED = 1
 """Number of the frame without a pose."""
 POSED = [number for number in range(COUNT) if number != UNPOSED]
-
-
-def write(folder: Path, name: str = "film", camera: str = "PINHOLE") -> Path:
-    """The wall, with frames as ViPE's program writes them."""
-    made = wall()
-    for kind in ("rgb", "pose", "intrinsics", "depth", "vipe"):
-        (folder / kind).mkdir(parents=True, exist_ok=True)
-    with av.open(str(folder / f"rgb/{name}.mp4"), "w") as out:
-        stream = out.add_stream("libx264rgb", rate=24, options={"crf": "0"})
-        stream.width, stream.height, stream.pix_fmt = made.images.shape[2], made.images.shape[1], "rgb24"
-        for image in made.images:
-            out.mux(stream.encode(av.VideoFrame.from_ndarray(image, "rgb24")))
-        out.mux(stream.encode())
-    poses = np.linalg.inv(made.viewmats).astype(np.float32)
-    np.savez(folder / f"pose/{name}.npz", data=poses[POSED], inds=np.array(POSED))
-    lens = np.tile(np.float32(K[[0, 1, 0, 1], [0, 1, 2, 2]]), (COUNT, 1))
-    np.savez(folder / f"intrinsics/{name}.npz", data=lens, inds=np.arange(COUNT))
-    (folder / f"intrinsics/{name}_camera.txt").write_text("".join(f"{i}: {camera}\n" for i in range(COUNT)))
-    (folder / f"vipe/{name}_info.pkl").write_bytes(b"\x80\x04.")
-    with zipfile.ZipFile(folder / f"depth/{name}.zip", "w", zipfile.ZIP_DEFLATED) as archive:
-        for number in range(COUNT):
-            write_exr(folder / "map.exr", {"Z": made.depths[number].astype(np.float16)})
-            if reads_exr():
-                archive.write(folder / "map.exr", f"{number:05d}.exr")
-    return folder
+write = partial(write_vipe, unposed=UNPOSED)
 
 
 @pytest.mark.parametrize("given", ["", "pose/film.npz", "rgb/film.mp4"])
