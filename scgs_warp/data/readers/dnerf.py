@@ -28,6 +28,7 @@ from ..points import read_points
 from .transforms import (
     Times,
     find_mask,
+    moments_of,
     note_reduced,
     read_distortion,
     read_lens,
@@ -143,7 +144,17 @@ def _times(folder: Path, path: Path, entries: list[dict[str, Any]]) -> Times:
     elsewhere = [entry for frames in others.values() for entry in frames]
     if _is_animation(others.get(transforms_path(folder, "train"), entries), [entries, *others.values()]):
         return Times(_numbers_as_times(entries, [*entries, *elsewhere]), ())
+    if not any(entry.get("time") is not None for entry in entries) and _of_several_cameras(entries):
+        moments = moments_of([Path(entry["file_path"]) for entry in entries])
+        return Times([moment / max(*moments, 1) for moment in moments], ())
     return read_times(path, entries, elsewhere)
+
+
+def _of_several_cameras(entries: list[dict[str, Any]]) -> bool:
+    """Return whether most of the images have names that are used in several folders: cameras that record at once."""
+    names = [entry.get("file_path") for entry in entries]
+    paths = [Path(name) for name in names if isinstance(name, str)]
+    return len(paths) == len(names) and 2 * len({path.stem for path in paths}) <= len({*paths})
 
 
 def _is_animation(training: list[dict[str, Any]], files: list[list[dict[str, Any]]]) -> bool:

@@ -35,6 +35,7 @@ from .model_points import points_of_model
 from .transforms import (
     Times,
     find_mask,
+    moments_of,
     note_reduced,
     read_distortion,
     read_lens,
@@ -161,26 +162,9 @@ def _times(path: Path, entries: list[dict[str, Any]], files: list[Path]) -> Time
     stamps = [as_number(entry.get("timestamp")) for entry in entries]
     if None not in stamps and len(set(stamps)) > 1 and len({file.parent for file in files}) == 1:
         return read_times(path, [{"time": stamp} for stamp in stamps])
-    moments = _moments(files)
+    moments = moments_of(files)
     last = max(len(set(moments)) - 1, 1)
     return Times([moment / last for moment in moments], ())
-
-
-def _moments(files: list[Path]) -> list[int]:
-    """Return the number of each image's moment, by the order of names. Of several folders whose images have the same
-    names, those of one name are of one moment: the folders are cameras that record at once."""
-    named: dict[str, set[Path]] = {}
-    for file in files:
-        named.setdefault(file.stem, set()).add(file.parent)
-    shared = sum(len(folders) > 1 for folders in named.values())
-    if 2 * shared > len(named):
-        names = [Path(name) for name in named]
-        ranks = {names[index].name: rank for rank, index in enumerate(by_name(names))}
-        return [ranks[file.stem] for file in files]
-    moments = [0] * len(files)
-    for rank, index in enumerate(by_name(files)):
-        moments[index] = rank
-    return moments
 
 
 def _of_split(path: Path, content: dict[str, Any], files: list[Path], indices: list[int], split: str) -> list[int]:

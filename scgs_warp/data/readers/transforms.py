@@ -17,6 +17,7 @@ from ...storage.json_files import as_number, numbers, read_json
 from ...storage.safe_paths import inside
 from ..images import header_sizes, is_reduced, size_text
 from ..lens import BROWN4, Lens, make_lens, rescaled
+from ..natural_order import by_name
 
 OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 SUFFIXES = (".png", ".jpg", ".jpeg", ".webp")
@@ -127,6 +128,23 @@ def read_times(path: Path, entries: list[dict[str, Any]], others: list[dict[str,
         raise UserError(f"{path}: the times of frames go from {first:g} to {last:g}; give numbers from 0 to 1")
     scaled = [(time - first) / length if length > 0.0 else 0.0 for time in times]
     return Times(scaled, (f"{path}: times from {first:.10g} to {last:.10g} are scaled to go from 0 to 1",))
+
+
+def moments_of(files: list[Path]) -> list[int]:
+    """Return the number of each image's moment, by the order of names. Of several folders whose images have the same
+    names, those of one name are of one moment: the folders are cameras that record at once."""
+    named: dict[str, set[Path]] = {}
+    for file in files:
+        named.setdefault(file.stem, set()).add(file.parent)
+    shared = sum(len(folders) > 1 for folders in named.values())
+    if 2 * shared > len(named):
+        names = [Path(name) for name in named]
+        ranks = {names[index].name: rank for rank, index in enumerate(by_name(names))}
+        return [ranks[file.stem] for file in files]
+    moments = [0] * len(files)
+    for rank, index in enumerate(by_name(files)):
+        moments[index] = rank
+    return moments
 
 
 def find_mask(path: Path, folder: Path, index: int, entry: dict[str, Any]) -> Path | None:

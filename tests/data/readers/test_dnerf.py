@@ -302,3 +302,21 @@ def test_points_of_filled_images(tmp_path, mode, varied, taken):
     if taken:
         np.testing.assert_allclose(data.points, places, atol=1e-6)
         np.testing.assert_allclose(data.colors, colors / 255.0, atol=1e-6)
+
+
+def test_images_of_several_cameras_that_record_at_once(tmp_path):
+    """As DiVa-360 and others list rigs without times: images of one name are of one moment."""
+    write_scene(tmp_path, frames=6)
+    for index in range(6):
+        folder = tmp_path / f"undist/cam{index // 2:02d}"
+        folder.mkdir(parents=True, exist_ok=True)
+        (tmp_path / f"train/r_{index:03d}.png").rename(folder / f"{index % 2:08d}.png")
+
+    def change(content):
+        for index, entry in enumerate(content["frames"]):
+            entry["file_path"] = f"undist/cam{index // 2:02d}/{index % 2:08d}.png"
+            del entry["time"]
+
+    edit(tmp_path, change)
+    (tmp_path / "transforms_test.json").unlink()
+    assert sorted([*load(tmp_path).times.tolist(), *load(tmp_path, "test").times.tolist()]) == [0.0] * 3 + [1.0] * 3
