@@ -24,6 +24,7 @@ MAX_MASKED = 0.5
 """Share of masked pixels above which masks, and not a lack of texture, leave few features; masks that are found cover
 less."""
 STANDS_STILL = "the camera stands still, so that nothing tells depth"
+WALK = "film from several places, walking sideways around the scene"
 LONG = 0.05
 """Share of a film's time, at one end, in which no frame has a camera, above which the user gets a note."""
 GOOD_SHARE = 0.9
@@ -60,7 +61,7 @@ def likely_reason(outcome: Outcome) -> str:
             "light, or give a larger --size"
         )
     if links.moved < STILL:
-        return f"{STANDS_STILL}: film from several places, walking sideways around the scene, or with several cameras"
+        return f"{STANDS_STILL}: {WALK}, or with several cameras"
     if outcome.masked > 0.3 and (links.linked < MIN_LINKED or links.inliers < MIN_INLIERS):
         return f"masks hide {100 * outcome.masked:.0f} % of the frames: give --masks none, or masks of your own"
     if links.linked < MIN_LINKED or links.inliers < MIN_INLIERS:
@@ -70,7 +71,7 @@ def likely_reason(outcome: Outcome) -> str:
             "or use a part without cuts (--start, --end)"
         )
     if links.planar > MAX_PLANAR or (outcome.registered and outcome.arc < MIN_ARC):
-        return "the camera turns but hardly moves: film from several places, walking sideways around the scene"
+        return f"the camera turns but hardly moves: {WALK}"
     if outcome.registered >= 2:
         more = f"give --frames {2 * outcome.picked}, or " if outcome.exhaustive else "give --matching exhaustive, or "
         if outcome.exhaustive and outcome.whole:
@@ -96,6 +97,11 @@ def notes(outcome: Outcome) -> list[str]:
         lines.append(f"note: {outcome.picked - outcome.registered} frames have no camera; {likely_reason(outcome)}")
     elif outcome.links.moved < STILL:
         lines.append(f"note: {STANDS_STILL}; the cameras found are those of what moves")
+    elif outcome.links.planar > MAX_PLANAR:
+        lines.append(
+            "note: the camera turns or zooms but hardly moves, or it films something flat: unless it does, depth and "
+            f"the places of the cameras are made up; {WALK}"
+        )
     elif outcome.arc < MIN_ARC:
         lines.append(f"note: rays to a point differ by {outcome.arc:.1f} degrees only; depth will be uncertain")
     return lines

@@ -32,6 +32,7 @@ def test_the_likeliest_reason_is_given():
     assert line.startswith("out: 20 of 50 frames registered") and "--least 0.4 " in line
     assert "--least" not in too_few("out", Outcome(50, 0, 0, LINKS, 0.1))
     assert not notes(Outcome(50, 50, 9, LINKS, 0.1)) and len(notes(Outcome(50, 40, 9, LINKS, 0.1))) == 1
+    assert "turns or zooms" in notes(Outcome(50, 50, 9, LINKS._replace(planar=1.0), 0.1))[0], "any depth fits a turn"
     assert "uncertain" in notes(Outcome(50, 50, 1.0, LINKS, 0.1))[0]
 
 
