@@ -32,6 +32,8 @@ from .source_frame import SourceFrame
 LONGEST = 1000
 """Largest time that names of images tell, as a multiple of that of images without gaps."""
 OPAQUE_SUFFIXES = (".jpg", ".jpeg", ".bmp")
+ALPHA_DECODERS = {"vp8": "libvpx", "vp9": "libvpx-vp9"}
+"""Decoders of films with alpha in WebM, by the names of ffmpeg's own decoders, which leave out the alpha."""
 SAMPLE = 100
 """Number of stored pictures that show whether they have times of display."""
 
@@ -178,10 +180,11 @@ class _Read:
         """Yield all frames that can be decoded, with their times on the file's clock."""
         from av.error import FFmpegError
 
+        decoder = _decoder(stream)
         for packet in container.demux(stream):
             self.hidden += bool(packet.size and packet.is_discard)
             try:
-                decoded = packet.decode()
+                decoded = packet.decode() if decoder is None else decoder.decode(packet)
             except FFmpegError:  # Later packets may be intact.
                 continue
             for frame in decoded:
@@ -189,6 +192,19 @@ class _Read:
                 self.decoded += 1
                 self.latest = max(self.latest, seconds or 0.0)
                 yield frame, seconds
+
+
+def _decoder(stream: Any) -> Any:
+    """Return the decoder that a film with alpha needs; None if the usual one does."""
+    import av
+
+    usual = stream.codec_context
+    name = None if usual is None or stream.metadata.get("alpha_mode") != "1" else ALPHA_DECODERS.get(usual.name)
+    if name not in av.codecs_available:
+        return None
+    decoder: Any = av.CodecContext.create(name, "r")
+    decoder.extradata = usual.extradata
+    return decoder
 
 
 def _lacks_times(container: Any, stream: Any) -> bool:
