@@ -6,6 +6,7 @@ Most are images of 0 and 255. Programs also write 0 and 1, 16 bits, or white ima
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from itertools import islice
 from pathlib import Path
 from typing import NamedTuple
 
@@ -66,16 +67,13 @@ def read_masks(
 
 def _of_film(masks: Source, source: Source, indices: Sequence[int], longest: int) -> Iterator[np.ndarray]:
     """Yield the frames of a film of masks."""
-    left = list(indices)
-    for still in masks.frames(longest):
-        if still.index == left[0]:
-            yield still.image
-            left.pop(0)
-        if not left:
-            return
-    raise UserError(
-        f"{masks.path}: ends before frame {left[0]} of {source.path}; give a mask for each frame of the video"
-    )
+    found = 0
+    for still in islice(masks.frames(longest, set(indices)), len(indices)):
+        yield still.image
+        found += 1
+    if found < len(indices):
+        missing = f"ends before frame {indices[found]} of {source.path}"
+        raise UserError(f"{masks.path}: {missing}; give a mask for each frame of the video")
 
 
 class _Values(NamedTuple):

@@ -6,7 +6,7 @@ import math
 import shutil
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager
-from itertools import takewhile
+from itertools import islice, takewhile
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -83,10 +83,9 @@ def pick_frames(request: CaptureRequest, source: Source, journal: Journal, show:
         written = _Written(folder)
         with show(len(chosen.indices), "writing frames") as bar:
             wanted = set(chosen.indices)
-            for still in _until(source.frames(request.size), max(wanted, default=-1)):
-                if still.index in wanted:
-                    written.add(still)
-                    bar.advance()
+            for still in islice(source.frames(request.size, wanted), len(wanted)):
+                written.add(still)
+                bar.advance()
         return written.finished(chosen)._asdict()
 
     settings = {key: getattr(request, key) for key in ("frames", "start", "end", "size")}
@@ -143,10 +142,6 @@ def frames_of(stored: Any) -> PickedFrames | None:
     except (KeyError, TypeError, AttributeError):
         return None
     return frames if whole and times and names and lengths else None
-
-
-def _until(stills: Iterator[SourceFrame], last: int) -> Iterator[SourceFrame]:
-    return takewhile(lambda still: still.index <= last, stills)
 
 
 def choose(request: CaptureRequest, source: Source, show: ShowProgress) -> PickedFrames:

@@ -49,8 +49,9 @@ class Source(Protocol):
     incomplete: Incomplete | None
     """What is there of an incomplete film, once all frames have been read."""
 
-    def frames(self, longest: int) -> Iterator[SourceFrame]:
-        """Yield all frames in order; larger frames are reduced so that the longer side has ``longest`` pixels.
+    def frames(self, longest: int, wanted: Container[int] | None = None) -> Iterator[SourceFrame]:
+        """Yield all frames in order, or only the ``wanted`` ones by their index; larger frames are reduced so that the
+        longer side has ``longest`` pixels.
 
         Raises:
             UserError: a frame cannot be decoded.
@@ -238,12 +239,14 @@ class Folder:
         self.count = len(self.files)
         self.moments = _moments([file.name for file in self.files])
 
-    def frames(self, longest: int) -> Iterator[SourceFrame]:
-        """Yield all images. Those of a camera that was held upright for some and not for others are turned to have the
-        size of most, so that all have one lens."""
+    def frames(self, longest: int, wanted: Container[int] | None = None) -> Iterator[SourceFrame]:
+        """Yield all images, or only the ``wanted`` ones by their index. Those of a camera that was held upright for
+        some and not for others are turned to have the size of most, so that all have one lens."""
         usual = self._usual
         size, turned = read_rgb(usual).shape[1::-1], turns_of(usual)
         for index, file in enumerate(self.files):
+            if wanted is not None and index not in wanted:
+                continue
             image, alpha = read_cut_out(file)
             turns = 0
             if image.shape[1::-1] == size[::-1] != size:

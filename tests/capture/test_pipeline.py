@@ -22,7 +22,8 @@ from helpers.films import cut_copy
 from helpers.full_disk import small_disk
 from helpers.paths import ROOT
 from helpers.room import Film, path_length, save, shoot
-from scgs_warp.capture import CaptureRequest, capture, mapping, picked_frames, pipeline
+from scgs_warp.capture import CaptureRequest, as_shown, capture, mapping, picked_frames, picking, pipeline, source
+from scgs_warp.capture.journal import Journal
 from scgs_warp.capture.similarity import align, centres
 from scgs_warp.capture.source import open_source
 from scgs_warp.data import load
@@ -266,6 +267,21 @@ def test_a_film_that_was_cut_off_is_said_to_be(tmp_path, filmed):
     cut_copy(filmed[1], cut, 0.3)
     with pytest.raises(UserError, match=rf"cut\.mp4: only \d of {FRAMES} frames can be decoded"):
         run(cut, tmp_path / "few")
+
+
+def test_frames_that_are_not_picked_are_converted_once(tmp_path, filmed, monkeypatch):
+    """Most of a long film in 4K is only looked at, reduced; at full size, converting it takes minutes."""
+    sizes: list[int] = []
+
+    def picture(frame, longest: int, shape: float):
+        sizes.append(longest)
+        return as_shown.picture(frame, longest, shape)
+
+    monkeypatch.setattr(source, "picture", picture)
+    request, journal = CaptureRequest(filmed[1], frames=8), Journal(tmp_path, lambda earlier: "")
+    with journal.started():
+        made = picked_frames.pick_frames(request, open_source(filmed[1]), journal, silent)
+    assert sizes == FRAMES * [picking.SHARPNESS_SIDE] + len(made.indices) * [request.size]
 
 
 def test_images_that_have_nothing_in_common(tmp_path):
