@@ -16,7 +16,9 @@ BLACK = 24
 """Largest value of a channel in a bar; compression makes black uneven."""
 SHOWN = 0.8
 """Least share of the pixels of the first line beside a bar that show something in the course of the film. A thing
-before a dark background has no such edge."""
+before a dark background has no such edge. In a bar, subtitles, or the clock of a phone, may show fewer."""
+EMPTY = 0.02
+"""Largest share of the pixels of the last line of a bar, beyond its blurred edge, that show something."""
 EDGE = 2
 """Width of the blurred edge, pixels, which is cut off as well."""
 LEAST = 0.02
@@ -47,17 +49,17 @@ def find_bars(brightest: np.ndarray) -> Bars:
 
 def _pair(brightest: np.ndarray) -> tuple[int, int]:
     """Return the widths of the bars above and below; zeros without them."""
-    bright = np.flatnonzero(brightest.max(1) > BLACK)
-    if not len(bright):
+    shares = (brightest > BLACK).mean(1)
+    shown = np.flatnonzero(shares >= SHOWN)
+    if not len(shown):
         return 0, 0
-    height, first, last = len(brightest), int(bright[0]), int(bright[-1])
-    above, below = first, height - 1 - last
-    if min(above, below) < LEAST * height or abs(above - below) > max(2, UNEVEN * height):
+    height, above, below = len(shares), int(shown[0]), len(shares) - 1 - int(shown[-1])
+    if min(above, below) < max(LEAST * height, EDGE + 1) or abs(above - below) > max(2, UNEVEN * height):
         return 0, 0
-    if last - first < 4 * EDGE:
+    if shown[-1] - shown[0] < 4 * EDGE:
         return 0, 0
-    shown = (brightest[[first + EDGE, last - EDGE]] > BLACK).mean(1).min()
-    return (above + EDGE, below + EDGE) if shown >= SHOWN else (0, 0)
+    beside = max(shares[above - EDGE - 1], shares[height - below + EDGE])
+    return (above + EDGE, below + EDGE) if beside <= EMPTY else (0, 0)
 
 
 def cut_off(folder: Path, names: Sequence[str], bars: Bars) -> None:

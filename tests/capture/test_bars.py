@@ -24,6 +24,14 @@ def test_bars_are_found(widths):
     assert find_bars(brightest(*widths)) == tuple(width + EDGE if width else 0 for width in widths)
 
 
+def test_captions_are_cut_off_with_their_bar():
+    film = brightest(20, 20)
+    film[6:14, 30:130] = 240  # subtitles
+    film[-9:-3, 4:20] = 200  # a clock
+    assert find_bars(film) == Bars(22, 22)
+    assert find_bars(film.T) == Bars(0, 0, 22, 22)
+
+
 @pytest.mark.parametrize("widths", [(0, 0, 0, 0), (1, 1, 0, 0), (16, 0, 0, 0), (30, 10, 0, 0)])
 def test_what_is_narrow_or_on_one_side_is_left(widths):
     assert find_bars(brightest(*widths)) == Bars()
