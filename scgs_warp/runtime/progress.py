@@ -100,8 +100,10 @@ class Progress:
         self._next = self._began
 
     def advance(self, n: int = 1, **fields: Any) -> None:
-        """Count ``n`` more steps; ``fields`` (numbers, text) replace those of the same name, and None removes one."""
+        """Count ``n`` more steps; ``fields`` (numbers, text) replace those of the same name, and None removes one. A
+        total that turns out too small, as of a film whose header does not count its frames, grows."""
         self.done += n
+        self.total = max(self.total, self.done)
         if fields:
             self.fields.update(fields)
         now = time.perf_counter()
@@ -170,6 +172,7 @@ class _Reported(Progress):
 
     def advance(self, n: int = 1, **fields: Any) -> None:
         self.done += n
+        self.total = max(self.total, self.done)
         report = _report.get()
         if report is not None:
             report(self.description, self.done, self.total)
@@ -237,7 +240,7 @@ class _TerminalBar(Progress):
         timing = f"{self.describe_rate()}  {clock(self.elapsed)} < {self.describe_left()}"
         # rich would read [words] in square brackets as markup.
         text = self.describe_fields().replace("[", "(").replace("]", ")")
-        self._rich.update(self._task, completed=self.done, timing=timing, text=text, refresh=True)
+        self._rich.update(self._task, completed=self.done, total=self.total, timing=timing, text=text, refresh=True)
         return now + REDRAW_SECONDS
 
     def _print(self, text: str) -> None:

@@ -7,7 +7,7 @@ import os
 
 import pytest
 
-from scgs_warp.runtime.progress import clock, progress, say
+from scgs_warp.runtime.progress import clock, progress, reported, say
 
 
 @pytest.mark.parametrize(("seconds", "text"), [(0, "0:00"), (59.6, "1:00"), (123, "2:03"), (3723, "1:02:03")])
@@ -95,3 +95,15 @@ def test_what_a_stream_cannot_encode_is_escaped(monkeypatch: pytest.MonkeyPatch)
 def test_say_prints_one_line(capsys: pytest.CaptureFixture) -> None:
     say("done")
     assert capsys.readouterr().out == "done\n"
+
+
+def test_a_total_that_is_too_small_grows(capsys: pytest.CaptureFixture) -> None:
+    """Films that were recorded by a browser do not say how many frames they have."""
+    seen: list[tuple[int, int]] = []
+    with progress(1, "looking") as bar:
+        for _ in range(24):
+            bar.advance()
+    assert "looking 24/24 (100 %)" in capsys.readouterr().out
+    with reported(lambda work, done, total: seen.append((done, total))), progress(1, "looking") as bar:
+        bar.advance(3)
+    assert seen == [(3, 3)]
