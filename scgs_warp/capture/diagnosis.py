@@ -20,6 +20,8 @@ STILL = 0.002
 """Motion of matches, as a share of the longer side, below which the camera stands still."""
 MIN_ARC = 2.0
 """Smallest useful angle between the rays to a point, degrees; at smaller angles, depth is unreliable."""
+WEAK_ARC = 4.0
+"""Such an angle below which cameras may be missing although all frames that follow each other match."""
 MAX_MASKED = 0.5
 """Share of masked pixels above which masks, and not a lack of texture, leave few features; masks that are found cover
 less."""
@@ -72,6 +74,8 @@ def likely_reason(outcome: Outcome) -> str:
         )
     if links.planar > MAX_PLANAR or (outcome.registered and outcome.arc < MIN_ARC):
         return f"the camera turns but hardly moves: {WALK}"
+    if outcome.registered >= 2 and links.linked == 1.0 and outcome.arc < WEAK_ARC:
+        return f"the camera hardly moves to the side, as when it goes straight ahead: {WALK}"
     if outcome.registered >= 2:
         more = f"give --frames {2 * outcome.picked}, or " if outcome.exhaustive else "give --matching exhaustive, or "
         if outcome.exhaustive and outcome.whole:

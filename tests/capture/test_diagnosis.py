@@ -21,6 +21,8 @@ def test_the_likeliest_reason_is_given():
         assert "camera stands still" in likely_reason(Outcome(50, 0, 0, links._replace(moved=0.0004), 0.35))
     assert "stands still" in notes(Outcome(50, 50, 9, LINKS._replace(moved=0.0004), 0.1))[0]
     assert "--matching" in likely_reason(Outcome(50, 20, 9, LINKS, 0.1))
+    assert "straight ahead" in likely_reason(Outcome(30, 5, 2.4, Links(2000, 1100, 1.0, 0.34), 0.1, True))
+    assert "parts" in likely_reason(Outcome(30, 5, 2.4, Links(2000, 1100, 0.97, 0.34), 0.1, True)), "a cut"
     assert "give --frames 100, or" in likely_reason(Outcome(50, 20, 9, LINKS, 0.1, True)), "matching was exhaustive"
     for alone in (
         Outcome(12, 0, 0, Links(2000, 0, 0.0, 0.2), 0.1, True, True),
