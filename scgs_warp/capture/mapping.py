@@ -5,17 +5,22 @@ from __future__ import annotations
 import shutil
 from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from .colmap import database_errors, quiet, read_model, write_model
-from .features import FrameFiles
+from .diagnosis import MAX_PLANAR
+from .features import FrameFiles, links
 
 MIN_VIEWS = 3
 """Smallest number of frames in which a point must be seen."""
 MAX_ERROR = 2.0
 """Largest mean reprojection error of a point, pixels."""
+FEW = 0.5
+"""Share of frames with a camera below which the mapper begins once more, with less parallax."""
+LITTLE_PARALLAX = 4.0
+"""Least angle, degrees, between the rays to the points of the two frames with which it begins then; COLMAP's is 16."""
 
 
 class CameraSolution(NamedTuple):
@@ -43,7 +48,9 @@ class CameraSolution(NamedTuple):
 def solve(database: Path, frame_files: FrameFiles, folder: Path, seed: int, done: Callable[[], object]) -> int:
     """Run the mapper and write its largest model to ``folder``.
 
-    The mapper runs on one thread, because sums over threads would differ from run to run.
+    The mapper runs on one thread, because sums over threads would differ from run to run. If few frames get a camera
+    although their matches show parallax, it runs once more and begins with less: a camera that goes straight ahead
+    sees surfaces from nearly the same side for long.
 
     Args:
         done: called after each registered frame.
@@ -54,6 +61,30 @@ def solve(database: Path, frame_files: FrameFiles, folder: Path, seed: int, done
     Raises:
         UserError: the model cannot be written.
     """
+    best = _largest_model(database, frame_files, folder, seed, done)
+    few = FEW * len(frame_files.names)
+    if _registered(best) < few and links(database, frame_files).planar <= MAX_PLANAR:
+        other = _largest_model(database, frame_files, folder, seed, done, LITTLE_PARALLAX)
+        best = max(best, other, key=_registered)
+    if _registered(best):
+        write_model(best, folder)
+    return _registered(best)
+
+
+def _largest_model(
+    database: Path,
+    frame_files: FrameFiles,
+    folder: Path,
+    seed: int,
+    done: Callable[[], object],
+    parallax: float | None = None,
+) -> Any:
+    """Run the mapper and return its largest model, or None.
+
+    Args:
+        parallax: least angle, degrees, between the rays to the points of the first two frames, which may then also lie
+            one straight ahead of the other; None: as COLMAP requires.
+    """
     attempts = folder.with_name(f"{folder.name}-attempts")
     shutil.rmtree(attempts, ignore_errors=True)
     attempts.mkdir(parents=True)
@@ -62,15 +93,19 @@ def solve(database: Path, frame_files: FrameFiles, folder: Path, seed: int, done
         options.mapper.num_threads = 1
         options.mapper.random_seed = seed
         options.triangulation.random_seed = seed
+        if parallax is not None:
+            options.mapper.init_min_tri_angle, options.mapper.init_max_forward_motion = parallax, 1.0
         pycolmap.set_random_seed(seed)
         models = pycolmap.incremental_mapping(
             database, frame_files.folder, attempts, options, next_image_callback=lambda: _ignore(done())
         )
-        best = max(models.values(), key=lambda model: (model.num_reg_images(), model.num_points3D()), default=None)
-        if best is not None and best.num_reg_images():
-            write_model(best, folder)
     shutil.rmtree(attempts, ignore_errors=True)
-    return 0 if best is None else best.num_reg_images()
+    return max(models.values(), key=lambda model: (model.num_reg_images(), model.num_points3D()), default=None)
+
+
+def _registered(model: Any) -> int:
+    """Return the number of frames of a model that have a camera; 0 without a model."""
+    return 0 if model is None else model.num_reg_images()
 
 
 def _ignore(_: object) -> None:
