@@ -25,6 +25,7 @@ class Purpose:
     FRAME_ORDER = 41
     BACKGROUND = 42
     TIME_NOISE = 43
+    TURNS = 44
     SILHOUETTE_PIXELS = 45
     FLOW_FRAME = 46
     SPLIT_GAUSSIANS = 51

@@ -47,6 +47,7 @@ PAPER = TrainConfig(
         shading=False,
         correctives=False,
         tints=False,
+        turns=False,
         mask=False,
         time_noise=0.0,
         bfloat16=False,

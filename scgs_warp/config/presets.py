@@ -91,7 +91,7 @@ def preset(name: PresetName) -> TrainConfig:
     quick = with_steps(cpu, 7_000)
     # Rigidity that spares no edge, neighbours by place alone, less sharpness: least error of motion on the built-in
     # figure.
-    motion = dataclasses.replace(quick.motion, hyper_dim=0, node_weight=False, correctives=False)
+    motion = dataclasses.replace(quick.motion, hyper_dim=0, node_weight=False, correctives=False, turns=False)
     loss = dataclasses.replace(quick.loss, arap_slack=0.0)
     changed = {"half_size": 3_500, "sharpness": 0.25, "pretrain": stage1, "motion": motion, "loss": loss}
     return dataclasses.replace(quick, preset="quick", **changed)

@@ -30,10 +30,11 @@ from .preflight import refuse_empty_chunks
 from .process_group import ProcessGroup, ProcessLost
 from .recorded_step import RecordedSteps
 from .resuming import as_begun
-from .run_folder import ReadOnlyRunFolder, RunFolder
+from .run_folder import ReadOnlyRunFolder, RunFolder, begin_or_resume
 from .second_try import try_again
 from .state import StepResult, TrainState
 from .step import training_step
+from .turns import add_turns, turns_due
 from .vanishing import refuse_empty, shows_nothing
 
 MOST_FAILURES = 20
@@ -101,7 +102,7 @@ def fit(
     # 2. Open the run folder, and start or resume the state.
     folder_type = RunFolder if group is None or group.first else ReadOnlyRunFolder
     with folder_type(output, config, settings, resume=resume, tensorboard=tensorboard) as folder:
-        open_state = partial(_start_or_resume, folder, config, data, device)
+        open_state = partial(begin_or_resume, folder, config, data, device)
         # The first process may have to restore a checkpoint before the others read it.
         state = group.in_turn(open_state) if group is not None and resume else open_state()
         state.group = group
@@ -135,20 +136,6 @@ def _end_here(state: TrainState, folder: RunFolder) -> None:
     _, metadata = checkpoint.read(folder.path, ())
     if metadata["config"]["steps"] != state.config.steps:
         state.save(folder.path)
-
-
-def _start_or_resume(folder: RunFolder, config: TrainConfig, data: Dataset, device: str) -> TrainState:
-    if folder.resume and folder.has_no_checkpoint:
-        folder.tell(f"{folder.path}: there is no checkpoint yet; training begins again from step 0")
-    elif folder.resume:
-        try:
-            return TrainState.resume(folder.path, config, data, device)
-        except checkpoint.DamagedCheckpoint as error:
-            if isinstance(folder, ReadOnlyRunFolder):
-                raise UserError(f"{error}; the first process could read it") from error
-            folder.tell(f"warning: {checkpoint.fall_back(folder.path, error)}")
-        return TrainState.resume(folder.path, config, data, device)
-    return TrainState.begin(config, data, device)
 
 
 class Watcher(Protocol):
@@ -206,6 +193,14 @@ def _train(
             _perhaps_again(state, frames, folder, bar, stop, watcher)
             state.begin_main()
 
+        if turns_due(state, frames.data):
+            _finish(state, steps, folder, bar)
+            steps.release()
+            found = add_turns(state, frames, lambda text: bar.advance(0, turns=text))
+            bar.advance(0, turns=None)
+            if found is not None:
+                _tell(found, state, folder, bar)
+
         # 2. Render, compare and update the parameters.
         done = state.step + 1
         tested = test is not None and (done % config.evaluate_every == 0 or done == config.steps)
@@ -223,8 +218,7 @@ def _train(
         note = control_density(state, results[-1].size, visible) if density_due(state) else None
         if note is not None and not noted:
             noted = True
-            bar.print(f"step {state.step}: {note}")
-            folder.log({"step": state.step, "stage": state.stage, "note": note})
+            _tell(note, state, folder, bar)
         state.step = done
         state.consistent = True
 
@@ -286,6 +280,12 @@ def _perhaps_again(
     bar.advance(0, second=None)
     bar.print(f"step {state.step}: {note}")
     folder.log({"step": state.step + 1, "stage": state.stage, "note": note})
+
+
+def _tell(note: str, state: TrainState, folder: RunFolder, bar: Progress) -> None:
+    """Print what a step found, and log it."""
+    bar.print(f"step {state.step}: {note}")
+    folder.log({"step": state.step, "stage": state.stage, "note": note})
 
 
 def _stopping(state: TrainState, stop: threading.Event) -> bool:

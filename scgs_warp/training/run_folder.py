@@ -22,6 +22,7 @@ from ..evaluation.image_metrics import psnr
 from ..evaluation.run_time import log_entries
 from ..runtime.progress import Progress, say
 from ..scene.scene import Scene
+from ..storage import checkpoint
 from ..storage.checkpoint import FILE, PREVIOUS
 from ..storage.files import read_text, write_atomically
 from ..storage.json_files import parse_json
@@ -328,3 +329,22 @@ class ReadOnlyRunFolder(RunFolder):
 
     def log_test_psnr(self, scene: Scene, test: Dataset, step: int) -> None:
         pass
+
+
+def begin_or_resume(folder: RunFolder, config: TrainConfig, data: Dataset, device: str) -> TrainState:
+    """Return the state with which training goes on: that of the newest readable checkpoint, or the first one.
+
+    Raises:
+        UserError: the checkpoint does not fit the configuration or the data.
+    """
+    if folder.resume and folder.has_no_checkpoint:
+        folder.tell(f"{folder.path}: there is no checkpoint yet; training begins again from step 0")
+    elif folder.resume:
+        try:
+            return TrainState.resume(folder.path, config, data, device)
+        except checkpoint.DamagedCheckpoint as error:
+            if isinstance(folder, ReadOnlyRunFolder):
+                raise UserError(f"{error}; the first process could read it") from error
+            folder.tell(f"warning: {checkpoint.fall_back(folder.path, error)}")
+        return TrainState.resume(folder.path, config, data, device)
+    return TrainState.begin(config, data, device)

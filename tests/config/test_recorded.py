@@ -51,6 +51,7 @@ def test_best_is_the_former_paper_in_half_the_steps():
         "motion.correctives": True,
         "optim.correctives": 8e-4,
         "motion.tints": True,
+        "motion.turns": True,
         "loss.arap_slack": 0.5,
         "loss.log_error": 0.002,
         "loss.log_error_from": 0.58,
@@ -76,6 +77,7 @@ def test_a_recorded_configuration_keeps_what_it_did(name):
     read = presets.to_dict(presets.from_dict(values))
     assert read["loss"].pop("log_error") == 0.0 and read["sharpness"] == 0.0
     assert not read["loss"]["random_background"]
+    assert not read["motion"]["turns"]
     assert not read["motion"]["tints"] and not read["motion"]["correctives"]
     for section, fields in values.items():
         own = read[section]
