@@ -200,7 +200,9 @@ def _decoder(stream: Any) -> Any:
     import av
 
     usual = stream.codec_context
-    name = None if usual is None or stream.metadata.get("alpha_mode") != "1" else ALPHA_DECODERS.get(usual.name)
+    if usual is None or stream.metadata.get("alpha_mode") != "1":
+        return None
+    name = ALPHA_DECODERS.get(usual.name)
     if name not in av.codecs_available:
         return None
     decoder: Any = av.CodecContext.create(name, "r")
