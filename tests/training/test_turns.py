@@ -20,7 +20,7 @@ from scgs_warp.data.dataset import Dataset
 from scgs_warp.gaussians import gaussians_from_points
 from scgs_warp.training import turns
 from scgs_warp.training.frames import Frames
-from scgs_warp.training.round_bodies import RoundBody, find_round_bodies
+from scgs_warp.training.round_bodies import RoundBody, _rotations, find_round_bodies
 from scgs_warp.training.state import TrainState
 from scgs_warp.training.turn_search import CLEARER, LONG, find_turns
 from scgs_warp.training.turn_views import Views
@@ -303,3 +303,23 @@ def test_turns_are_off_where_they_cannot_be_found():
     assert not schedule(5_999, freeze=6_000)
     assert preset("best").motion.turns and not preset("paper").motion.turns and not preset("quick").motion.turns
     assert CLEARER < 1.0
+
+
+def test_turns_that_show_the_views_worse_change_nothing(spinning, monkeypatch):
+    monkeypatch.setattr(turns, "STEPS", 20)
+    monkeypatch.setattr(turns, "TRIAL", 0.001)
+    monkeypatch.setattr(turns, "MOST_LOSS", -100.0)
+    state = grey_ball(spinning)
+    before = {name: value.clone() for name, value in state.scene().tensors().items()}
+    models = state.gaussians, state.motion, state.gaussian_optimizer, state.stats
+    assert turns.add_turns(state, frames_of(state, spinning)) is None
+    assert all(torch.equal(value, before[name]) for name, value in state.scene().tensors().items())
+    assert (state.gaussians, state.motion, state.gaussian_optimizer, state.stats) == models
+
+
+def test_a_mirrored_fit_is_no_rotation():
+    """Points of a flat body fit a mirrored one as well; only the rotation counts."""
+    flat = sphere(60) * np.array([1.0, 1.0, 0.0])
+    wanted = Rotation.from_rotvec([0.2, -0.4, 0.9]).as_matrix()
+    tracks = np.stack([flat, flat, flat @ wanted.T])
+    assert np.abs(_rotations(tracks)[2] - wanted).max() < 1e-6
