@@ -18,9 +18,9 @@ from scgs_warp.config.presets import preset
 from scgs_warp.data import load
 from scgs_warp.data.dataset import Dataset
 from scgs_warp.gaussians import gaussians_from_points
-from scgs_warp.training import turns
+from scgs_warp.training import round_bodies, turns
 from scgs_warp.training.frames import Frames
-from scgs_warp.training.round_bodies import RoundBody, _rotations, find_round_bodies
+from scgs_warp.training.round_bodies import RoundBody, find_round_bodies
 from scgs_warp.training.state import TrainState
 from scgs_warp.training.turn_search import CLEARER, LONG, find_turns
 from scgs_warp.training.turn_views import Views
@@ -318,8 +318,24 @@ def test_turns_that_show_the_views_worse_change_nothing(spinning, monkeypatch):
 
 
 def test_a_mirrored_fit_is_no_rotation():
-    """Points of a flat body fit a mirrored one as well; only the rotation counts."""
-    flat = sphere(60) * np.array([1.0, 1.0, 0.0])
+    """A nearly flat body whose small bumps have changed sides is mirrored with less error than turned."""
+    flat, bumps = sphere(60) * np.array([1.0, 1.0, 0.0]), sphere(60) * np.array([0.0, 0.0, 1e-3])
     wanted = Rotation.from_rotvec([0.2, -0.4, 0.9]).as_matrix()
-    tracks = np.stack([flat, flat, flat @ wanted.T])
-    assert np.abs(_rotations(tracks)[2] - wanted).max() < 1e-6
+    tracks = np.stack([flat + bumps, flat + bumps, (flat - bumps) @ wanted.T])
+    assert np.abs(round_bodies._rotations(tracks)[2] - wanted).max() < 1e-3
+
+
+def test_bodies_that_touch_for_a_moment_are_two():
+    first = tracks_of(sphere(200))
+    apart = np.zeros((INSTANTS, 1, 3), np.float32)
+    apart[:, 0, 0] = 2.0 * RADIUS + np.linspace(0.0, 1.0, INSTANTS)
+    labels = round_bodies._together(np.concatenate([first, first + apart], 1))
+    assert labels.max() == 1 and (labels[:200] == labels[0]).all() and (labels[200:] == labels[200]).all()
+
+
+def test_long_bodies_are_left_out(monkeypatch):
+    views, tracks = views_of(still, plain), tracks_of(sphere(300))
+    for stretch, count in ((1.5, 1), (2.5, 0)):
+        points = RADIUS * sphere(200) * np.array([1.0, 1.0, stretch])
+        monkeypatch.setattr(round_bodies, "_surface", lambda *_, points=points: points)
+        assert len(find_round_bodies(tracks, np.ones(300, bool), views)) == count
