@@ -29,8 +29,8 @@ from zoo_tables import (
     exposure,
     films,
     gallery,
+    motion_before_and_after,
     rig,
-    second_try,
     zoo,
 )
 
@@ -369,7 +369,8 @@ WRITERS: dict[str, Callable[[Source], str]] = {
     "rig": rig,
     "depth": depth,
     "crossing": crossing,
-    "second-try": second_try,
+    "second-try": motion_before_and_after("one try", "two tries"),
+    "turns": motion_before_and_after("without turns", "with turns"),
     "clips": clips,
     "gallery": gallery,
     "zoo": zoo,

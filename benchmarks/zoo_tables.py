@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from markdown_table import number, percent, signed, table, thousands
@@ -178,17 +179,25 @@ def crossing(source: Source) -> str:
     return table(["", "motion error", "PSNR", "worst", "Gaussians"], lines)
 
 
-def second_try(source: Source) -> str:
-    """Write the motion error, where there is truth, and PSNR of scenes without and with a second try at stage 1."""
-    rows = [source.label("before", "one try"), source.label("after", "two tries")]
-    lines = []
-    for scene in (*ZOO, "figure-seed-1"):
-        runs = source.run("before", scene), source.run("after", scene)
-        if all(runs):
-            cells = [number(run.get(key), 2) for key in ("epe", "psnr", "psnr_worst") for run in runs]
-            lines.append([scene.replace("-seed-", ", seed "), *cells])
-    head = [f"{name}, {row}" for name in ("motion error, %", "PSNR", "worst image") for row in rows]
-    return table(["", *head], lines)
+def motion_before_and_after(before: str, after: str) -> Callable[[Source], str]:
+    """Return a writer of the motion error, where there is truth, and PSNR of scenes before and after a change.
+
+    Args:
+        before: the columns' name for the row ``before``, and ``after`` likewise.
+    """
+
+    def write(source: Source) -> str:
+        rows = [source.label("before", before), source.label("after", after)]
+        lines = []
+        for scene in (*ZOO, "figure-seed-1"):
+            runs = source.run("before", scene), source.run("after", scene)
+            if all(runs):
+                cells = [number(run.get(key), 2) for key in ("epe", "psnr", "psnr_worst") for run in runs]
+                lines.append([scene.replace("-seed-", ", seed "), *cells])
+        head = [f"{name}, {row}" for name in ("motion error, %", "PSNR", "worst image") for row in rows]
+        return table(["", *head], lines)
+
+    return write
 
 
 def rig(source: Source) -> str:

@@ -203,24 +203,24 @@ def spinning(tmp_path_factory) -> Dataset:
     return load(folder, "train")
 
 
-def grey_ball(data: Dataset) -> TrainState:
+def grey_ball(data: Dataset, device: str) -> TrainState:
     """Begin the main stage with opaque grey Gaussians on the ball, which rest."""
     config = dataclasses.replace(preset("cpu"), init_points=600)
-    state = TrainState.begin(config, data, "cpu")
+    state = TrainState.begin(config, data, device)
     state.begin_main()
     state.step = config.pretrain_steps
-    places = state.normalisation.apply(torch.from_numpy(RADIUS * sphere(600)).float())
+    places = state.normalisation.apply(torch.from_numpy(RADIUS * sphere(600)).float()).to(device)
     options = {"hyper_columns": config.motion.hyper_columns, "shaded": True, "corrected": True}
     gaussians = gaussians_from_points(places, None, sh_degree=3, scale=0.4, sharpness=config.sharpness, **options)
     with torch.no_grad():
         gaussians.opacity_logits.fill_(4.0)
-        gaussians.shading.normal_(0.0, 0.1, generator=torch.Generator().manual_seed(0))
+        gaussians.shading.fill_(0.1)
     state.enter(gaussians, state.motion)
     return state
 
 
 def frames_of(state: TrainState, data: Dataset) -> Frames:
-    return Frames(data, state.normalisation, state.config, "cpu", None)
+    return Frames(data, state.normalisation, state.config, str(state.device), None)
 
 
 @torch.no_grad()
@@ -229,15 +229,16 @@ def error(state: TrainState, data: Dataset) -> float:
     scene = state.scene()
     scene.motion.eval()
     drawn = [
-        (scene.render(frame.camera, frame.time).rgb, frame.image) for frame in map(data.__getitem__, range(len(data)))
+        (scene.render(frame.camera, frame.time).rgb.cpu(), frame.image)
+        for frame in map(data.__getitem__, range(len(data)))
     ]
     return float(np.mean([float((rgb - image).square().mean()) for rgb, image in drawn]))
 
 
-def test_the_motion_takes_the_turns_and_the_gaussians_their_colours(spinning, monkeypatch):
+def test_the_motion_takes_the_turns_and_the_gaussians_their_colours(spinning, device, monkeypatch):
     monkeypatch.setattr(turns, "STEPS", 800)
     monkeypatch.setattr(turns, "TRIAL", 0.01)
-    state = grey_ball(spinning)
+    state = grey_ball(spinning, device)
     grey = error(state, spinning)
     note = turns.add_turns(state, frames_of(state, spinning))
     assert note is not None and note.startswith("1 round body turns by ")
@@ -249,7 +250,7 @@ def test_the_motion_takes_the_turns_and_the_gaussians_their_colours(spinning, mo
     motion.eval()
     with torch.no_grad():
         first, last = (motion.gaussians_at(state.gaussians, float(times[i])).means for i in (12, 24))
-    moved = rotation_between(first.numpy(), last.numpy())
+    moved = rotation_between(first.cpu().numpy(), last.cpu().numpy())
     wanted = spin(24) @ spin(12).T
     assert np.degrees(Rotation.from_matrix(moved @ wanted.T).magnitude()) < 12.0
 
@@ -267,7 +268,7 @@ def test_the_result_does_not_depend_on_the_threads(spinning, monkeypatch):
     results = []
     for threads in (1, 2):
         torch.set_num_threads(threads)
-        state = grey_ball(spinning)
+        state = grey_ball(spinning, "cpu")
         assert turns.add_turns(state, frames_of(state, spinning)) is not None
         results.append(state.scene().tensors())
     torch.set_num_threads(1)
@@ -305,11 +306,11 @@ def test_turns_are_off_where_they_cannot_be_found():
     assert CLEARER < 1.0
 
 
-def test_turns_that_show_the_views_worse_change_nothing(spinning, monkeypatch):
+def test_turns_that_show_the_views_worse_change_nothing(spinning, device, monkeypatch):
     monkeypatch.setattr(turns, "STEPS", 20)
     monkeypatch.setattr(turns, "TRIAL", 0.001)
     monkeypatch.setattr(turns, "MOST_LOSS", -100.0)
-    state = grey_ball(spinning)
+    state = grey_ball(spinning, device)
     before = {name: value.clone() for name, value in state.scene().tensors().items()}
     models = state.gaussians, state.motion, state.gaussian_optimizer, state.stats
     assert turns.add_turns(state, frames_of(state, spinning)) is None
