@@ -97,7 +97,7 @@ class Progress:
         self._began = time.perf_counter()
         self._start = start
         self._marks: deque[tuple[float, int]] = deque([(self._began, start)])
-        self._next = self._began
+        self._next = self._last = self._began
 
     def advance(self, n: int = 1, **fields: Any) -> None:
         """Count ``n`` more steps; ``fields`` (numbers, text) replace those of the same name, and None removes one. A
@@ -109,6 +109,12 @@ class Progress:
         now = time.perf_counter()
         if now >= self._next:
             self._next = self._safely(lambda: self._draw(now), now)
+
+    def beside(self, **fields: Any) -> None:
+        """Replace fields during work that is no step; its time, since the last call, does not count in the rate."""
+        now = time.perf_counter()
+        self._marks = deque((then + now - self._last, done) for then, done in self._marks)
+        self.advance(0, **fields)
 
     def print(self, text: str) -> None:
         """Print a line that stays, above the bar."""

@@ -196,8 +196,8 @@ def _train(
         if turns_due(state, frames.data):
             _finish(state, steps, folder, bar)
             steps.release()
-            found = add_turns(state, frames, lambda text: bar.advance(0, turns=text))
-            bar.advance(0, turns=None)
+            found = add_turns(state, frames, lambda text: bar.beside(turns=text))
+            bar.beside(turns=None)
             if found is not None:
                 _tell(found, state, folder, bar)
 
@@ -263,7 +263,7 @@ def _perhaps_again(
 
     def go_on(second: TrainState) -> None:
         left = (time.monotonic() - began) / second.step * (total - second.step)
-        bar.advance(0, second=f"{second.step:,}/{total:,}, {clock(left)} left")
+        bar.beside(second=f"{second.step:,}/{total:,}, {clock(left)} left")
         if watcher is not None and watcher.due():
             watcher.show(second)
         if _stopping(state, stop):
@@ -277,7 +277,7 @@ def _perhaps_again(
         _stop(state, bar)
     except UserError as error:
         raise _saved(state, error) from error
-    bar.advance(0, second=None)
+    bar.beside(second=None)
     bar.print(f"step {state.step}: {note}")
     folder.log({"step": state.step + 1, "stage": state.stage, "note": note})
 

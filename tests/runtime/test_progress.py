@@ -7,6 +7,7 @@ import os
 
 import pytest
 
+from scgs_warp.runtime import progress as module
 from scgs_warp.runtime.progress import clock, progress, reported, say
 
 
@@ -66,6 +67,23 @@ class Broken(io.StringIO):
 
     def fileno(self) -> int:
         return self.file.fileno()
+
+
+def test_work_beside_the_steps_does_not_count_for_the_rate(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = 0.0
+    monkeypatch.setattr(module.time, "perf_counter", lambda: now)
+    bar = module._LogLines(100, "training", io.StringIO(), 0)
+    for _ in range(10):
+        now += 1.0
+        bar.advance(1)
+    for _ in range(5):
+        now += 20.0
+        bar.beside(turns="looking")
+    now += 1.0
+    bar.advance(1)
+    bar.beside(turns=None)
+    assert bar.rate == pytest.approx(1.0)
+    assert bar.fields["turns"] is None
 
 
 def test_work_goes_on_where_nobody_reads() -> None:
