@@ -106,7 +106,7 @@ class Progress:
         self.total = max(self.total, self.done)
         if fields:
             self.fields.update(fields)
-        now = time.perf_counter()
+        now = self._last = time.perf_counter()
         if now >= self._next:
             self._next = self._safely(lambda: self._draw(now), now)
 
