@@ -189,11 +189,11 @@ def motion_before_and_after(before: str, after: str) -> Callable[[Source], str]:
     def write(source: Source) -> str:
         rows = [source.label("before", before), source.label("after", after)]
         lines = []
-        for scene in (*ZOO, "figure-seed-1"):
+        for scene in (*ZOO, "figure-seed-1", "balls-6000"):
             runs = source.run("before", scene), source.run("after", scene)
             if all(runs):
                 cells = [number(run.get(key), 2) for key in ("epe", "psnr", "psnr_worst") for run in runs]
-                lines.append([scene.replace("-seed-", ", seed "), *cells])
+                lines.append([scene.replace("-seed-", ", seed ").replace("-6000", ", 6,000 steps"), *cells])
         head = [f"{name}, {row}" for name in ("motion error, %", "PSNR", "worst image") for row in rows]
         return table(["", *head], lines)
 
