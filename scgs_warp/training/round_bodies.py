@@ -29,6 +29,8 @@ FACING = 0.5
 """Cosine between a direction and that to the camera from which its depth tells where the surface is."""
 WITHIN = (0.5, 1.4)
 """Distances from the centre, in radii, between which rendered depth is that of the body."""
+SMALLEST = 5.0
+"""Smallest radius of a body in the compared images, pixels: smaller ones show no texture."""
 FEWEST_VIEWS = 3
 """Smallest number of views that must show the surface in a direction."""
 ROUND = 1.8
@@ -108,12 +110,21 @@ def _round_body(tracks: np.ndarray, members: np.ndarray, solid: np.ndarray, view
         return None
     low, high = np.quantile(tracks[:, firm], (1.0 - OUTERMOST, OUTERMOST), axis=1)
     centres = 0.5 * (low + high)
+    radius = float(np.median(0.5 * (high - low)))
+    if _pixels(radius, centres, views) < SMALLEST:
+        return None
     rotations = _rotations(tracks[:, firm] - centres[:, None])
-    points = _surface(centres, rotations, float(np.median(0.5 * (high - low))), views)
+    points = _surface(centres, rotations, radius, views)
     if len(points) < DIRECTIONS // 4:
         return None
     spread = np.sqrt(np.maximum(np.linalg.eigvalsh(np.cov(points.T)), 0.0))
     return None if spread[-1] > ROUND * spread[0] else RoundBody(members, centres, rotations, points)
+
+
+def _pixels(radius: float, centres: np.ndarray, views: Views) -> float:
+    """Return the median length of a radius in the views."""
+    depths = [views.project(view, centres[instant])[2] for view, instant in enumerate(views.instants)]
+    return float(np.median(radius * views.intrinsics[:, 0, 0] / np.array(depths)))
 
 
 def _rotations(offsets: np.ndarray) -> np.ndarray:

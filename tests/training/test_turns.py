@@ -340,3 +340,11 @@ def test_long_bodies_are_left_out(monkeypatch):
         points = RADIUS * sphere(200) * np.array([1.0, 1.0, stretch])
         monkeypatch.setattr(round_bodies, "_surface", lambda *_, points=points: points)
         assert len(find_round_bodies(tracks, np.ones(300, bool), views)) == count
+
+
+def test_bodies_of_a_few_pixels_are_left_out(monkeypatch):
+    views, tracks = views_of(spin, spots), tracks_of(sphere(300))
+    pixels = RADIUS * FOCAL / 3.0
+    for smallest, count in ((0.9 * pixels, 1), (1.1 * pixels, 0)):
+        monkeypatch.setattr(round_bodies, "SMALLEST", smallest)
+        assert len(find_round_bodies(tracks, np.ones(300, bool), views)) == count
