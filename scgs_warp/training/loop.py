@@ -22,7 +22,6 @@ from ..runtime.memory import NotEnoughMemory
 from ..runtime.progress import Progress, clock, progress
 from ..runtime.stop_signals import stop_signals
 from ..scene.scene import Scene
-from ..storage import checkpoint
 from .density_control import Steps, control_density, density_due, take_step
 from .frames import Frames
 from .multi_view import StepInterrupted, check_replicas, check_share
@@ -30,7 +29,7 @@ from .preflight import refuse_empty_chunks
 from .process_group import ProcessGroup, ProcessLost
 from .recorded_step import RecordedSteps
 from .resuming import as_begun
-from .run_folder import ReadOnlyRunFolder, RunFolder, begin_or_resume
+from .run_folder import ReadOnlyRunFolder, RunFolder, begin_or_resume, end_here
 from .second_try import try_again
 from .state import StepResult, TrainState
 from .step import training_step
@@ -112,7 +111,7 @@ def fit(
         if config.loss.flow > state.config.loss.flow:
             folder.tell("loss.flow has no effect: frames that follow each other show too different things")
         if resume and state.step == config.steps and (group is None or group.first):
-            _end_here(state, folder)
+            end_here(state, folder)
         frames = Frames(data, state.normalisation, config, device, state.compared_stereo(data))
         folder.start(state.step)
 
@@ -129,13 +128,6 @@ def fit(
         scene = state.scene()
         scene.folder = folder.path.absolute()
         return scene
-
-
-def _end_here(state: TrainState, folder: RunFolder) -> None:
-    """Save a run whose last step is now the one that it has reached, unless its checkpoint says so already."""
-    _, metadata = checkpoint.read(folder.path, ())
-    if metadata["config"]["steps"] != state.config.steps:
-        state.save(folder.path)
 
 
 class Watcher(Protocol):
@@ -196,10 +188,7 @@ def _train(
         if turns_due(state, frames.data):
             _finish(state, steps, folder, bar)
             steps.release()
-            found = add_turns(state, frames, lambda text: bar.beside(turns=text))
-            bar.beside(turns=None)
-            if found is not None:
-                _tell(found, state, folder, bar)
+            _add_turns(state, frames, folder, bar)
 
         # 2. Render, compare and update the parameters.
         done = state.step + 1
@@ -218,7 +207,7 @@ def _train(
         note = control_density(state, results[-1].size, visible) if density_due(state) else None
         if note is not None and not noted:
             noted = True
-            _tell(note, state, folder, bar)
+            _tell(note, state, folder, bar, done=state.step)
         state.step = done
         state.consistent = True
 
@@ -278,14 +267,24 @@ def _perhaps_again(
     except UserError as error:
         raise _saved(state, error) from error
     bar.beside(second=None)
-    bar.print(f"step {state.step}: {note}")
-    folder.log({"step": state.step + 1, "stage": state.stage, "note": note})
+    _tell(note, state, folder, bar, done=state.step + 1)
 
 
-def _tell(note: str, state: TrainState, folder: RunFolder, bar: Progress) -> None:
-    """Print what a step found, and log it."""
+def _add_turns(state: TrainState, frames: Frames, folder: RunFolder, bar: Progress) -> None:
+    """Add the turns of round bodies to the motion, if there are any."""
+    try:
+        note = add_turns(state, frames, lambda text: bar.beside(turns=text))
+    except UserError as error:
+        raise _saved(state, error) from error
+    bar.beside(turns=None)
+    if note is not None:
+        _tell(note, state, folder, bar, done=state.step + 1)
+
+
+def _tell(note: str, state: TrainState, folder: RunFolder, bar: Progress, done: int) -> None:
+    """Print what was found, and log it at step ``done``: a resumed run repeats what lies after its checkpoint."""
     bar.print(f"step {state.step}: {note}")
-    folder.log({"step": state.step, "stage": state.stage, "note": note})
+    folder.log({"step": done, "stage": state.stage, "note": note})
 
 
 def _stopping(state: TrainState, stop: threading.Event) -> bool:

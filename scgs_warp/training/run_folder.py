@@ -348,3 +348,10 @@ def begin_or_resume(folder: RunFolder, config: TrainConfig, data: Dataset, devic
             folder.tell(f"warning: {checkpoint.fall_back(folder.path, error)}")
         return TrainState.resume(folder.path, config, data, device)
     return TrainState.begin(config, data, device)
+
+
+def end_here(state: TrainState, folder: RunFolder) -> None:
+    """Save a run whose last step is now the one that it has reached, unless its checkpoint says so already."""
+    _, metadata = checkpoint.read(folder.path, ())
+    if metadata["config"]["steps"] != state.config.steps:
+        state.save(folder.path)
