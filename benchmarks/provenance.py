@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import functools
+import json
 import re
 import subprocess
 from collections.abc import Iterable
 from pathlib import Path
+
+from markdown_table import table
 
 ROOT = Path(__file__).resolve().parent.parent
 REPORTED, OLDER = "†", "‡"
@@ -70,3 +73,14 @@ def older_note(commits: Iterable[str]) -> str:
 def without_older_marks(page: str) -> str:
     """Remove the marks that depend on the history of the repository, so that only figures are compared."""
     return re.sub(rf"\n*^{OLDER} .*$", "", page, flags=re.MULTILINE).replace(f" {OLDER}", "")
+
+
+def reported_table(path: Path) -> str:
+    """Write a table as it was reported.
+
+    Its file holds ``commit``, ``head`` and ``rows``, each with ``cells`` and, if it differs, its ``commit``.
+    """
+    values = json.loads(path.read_text(encoding="utf-8"))
+    lines = [[f"{row['cells'][0]} {REPORTED}".strip(), *row["cells"][1:]] for row in values["rows"]]
+    commits = [row.get("commit", values["commit"]) for row in values["rows"]]
+    return f"{table(values['head'], lines, numbers=False)}\n\n{reported_note(commits)}"

@@ -388,14 +388,3 @@ def quality_table(name: str, results: Path) -> str:
     source = Source(read_runs(results), name, read_literature(results, name))
     text = WRITERS[name](source)
     return "\n\n".join(part for part in (text, source.notes()) if part)
-
-
-def reported_table(path: Path) -> str:
-    """Write a table as it was reported.
-
-    Its file holds ``commit``, ``head`` and ``rows``, each with ``cells`` and, if it differs, its ``commit``.
-    """
-    values = json.loads(path.read_text(encoding="utf-8"))
-    lines = [[f"{row['cells'][0]} {REPORTED}".strip(), *row["cells"][1:]] for row in values["rows"]]
-    commits = [row.get("commit", values["commit"]) for row in values["rows"]]
-    return f"{table(values['head'], lines, numbers=False)}\n\n{reported_note(commits)}"

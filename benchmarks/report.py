@@ -25,8 +25,8 @@ from kernel_tables import WRITERS as KERNELS
 from kernel_tables import kernel_table
 from mutation_table import NAME as MUTATION
 from mutation_table import mutation_table
-from provenance import ROOT, without_older_marks
-from quality_tables import WRITERS, quality_table, reported_table
+from provenance import ROOT, reported_table, without_older_marks
+from quality_tables import WRITERS, quality_table
 from repeatable_tables import REPEATABLE, repeatable_table
 from timing_tables import BENCHMARKS, speed_overview, speed_ratios, timing_table
 

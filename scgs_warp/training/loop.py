@@ -188,7 +188,7 @@ def _train(
         if turns_due(state, frames.data):
             _finish(state, steps, folder, bar)
             steps.release()
-            _add_turns(state, frames, folder, bar)
+            _add_turns(state, frames, folder, bar, stop)
 
         # 2. Render, compare and update the parameters.
         done = state.step + 1
@@ -270,11 +270,20 @@ def _perhaps_again(
     _tell(note, state, folder, bar, done=state.step + 1)
 
 
-def _add_turns(state: TrainState, frames: Frames, folder: RunFolder, bar: Progress) -> None:
-    """Add the turns of round bodies to the motion, if there are any."""
+def _add_turns(state: TrainState, frames: Frames, folder: RunFolder, bar: Progress, stop: threading.Event) -> None:
+    """Add the turns of round bodies to the motion; a run that is stopped here looks for them again when resumed."""
+
+    def tell(text: str) -> None:
+        bar.beside(turns=text)
+        if stop.is_set():
+            raise StepInterrupted
+
+    state.save(folder.path)
     try:
-        note = add_turns(state, frames, lambda text: bar.beside(turns=text))
-    except UserError as error:
+        note = add_turns(state, frames, tell)
+    except StepInterrupted:
+        _stop(state, bar)
+    except FrameError as error:
         raise _saved(state, error) from error
     bar.beside(turns=None)
     if note is not None:
@@ -326,26 +335,18 @@ def _take(
     try:
         visible = take_step(state, frames, steps, results, looked_at)
         return results, visible
-    except NotEnoughMemory:  # nothing has changed yet: a machine with more memory can continue
+    except (NotEnoughMemory, StepInterrupted, FrameError) as error:
         _finish(state, steps, folder, bar, results)
         state.save(folder.path)
-        raise
-    except StepInterrupted:
-        _finish(state, steps, folder, bar, results)
-        state.save(folder.path)
-        _stop(state, bar)
-    except FrameError as error:
-        _finish(state, steps, folder, bar, results)
-        state.save(folder.path)
-        raise _saved(state, error) from error
+        if isinstance(error, StepInterrupted):
+            _stop(state, bar)
+        if isinstance(error, FrameError):
+            raise _saved(state, error) from error
+        raise  # nothing has changed yet: a machine with more memory can continue
 
 
 def _finish(
-    state: TrainState,
-    steps: Steps,
-    folder: RunFolder,
-    bar: Progress,
-    known: Sequence[StepResult] = (),
+    state: TrainState, steps: Steps, folder: RunFolder, bar: Progress, known: Sequence[StepResult] = ()
 ) -> None:
     """Wait for the steps in flight, and report them after those ``known``."""
     for result in [*known, *steps.settle()]:

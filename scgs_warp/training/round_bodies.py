@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
+from scipy.spatial.transform import Rotation
 
 from ..ops.sampling import farthest_points
 from ..runtime.search_tree import search_tree
@@ -128,11 +129,9 @@ def _pixels(radius: float, centres: np.ndarray, views: Views) -> float:
 
 
 def _rotations(offsets: np.ndarray) -> np.ndarray:
-    """Fit the rotation from the middle instant to each, [T, 3, 3], to offsets [T, n, 3] from the centre (Kabsch)."""
-    products = np.einsum("tni,nj->tij", offsets, offsets[len(offsets) // 2])
-    left, _, right = np.linalg.svd(products.astype(np.float64))
-    left[:, :, 2] *= np.sign(np.linalg.det(left @ right))[:, None]
-    return left @ right
+    """Fit the rotation from the middle instant to each, [T, 3, 3], to offsets [T, n, 3] from the centre."""
+    middle = offsets[len(offsets) // 2]
+    return np.stack([Rotation.align_vectors(there, middle)[0].as_matrix() for there in offsets])
 
 
 def _surface(centres: np.ndarray, rotations: np.ndarray, radius: float, views: Views) -> np.ndarray:
@@ -147,7 +146,9 @@ def _surface(centres: np.ndarray, rotations: np.ndarray, radius: float, views: V
         places = centres[instant] + radius * outward
         x, y, depth = views.project(view, places)
         eye = views.eye(view) - centres[instant]
-        there = places - (1.0 - views.depth_at(view, x, y) / depth)[:, None] * (places - views.eye(view))
+        share = views.depth_at(view, x, y) / depth
+        share[~np.isfinite(share)] = np.nan  # nothing is rendered there
+        there = views.eye(view) + share[:, None] * (places - views.eye(view))
         apart = np.linalg.norm(there - centres[instant], axis=1)
         shown = outward @ eye > FACING * np.linalg.norm(eye)
         shown &= (apart > WITHIN[0] * radius) & (apart < WITHIN[1] * radius)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import signal
 from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any, cast
@@ -14,12 +15,14 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
+from helpers.tiny import tiny_config, tiny_dataset
 from scgs_warp.config.presets import preset
 from scgs_warp.data import load
 from scgs_warp.data.dataset import Dataset
 from scgs_warp.gaussians import gaussians_from_points
-from scgs_warp.training import round_bodies, turns
+from scgs_warp.training import loop, round_bodies, turns
 from scgs_warp.training.frames import Frames
+from scgs_warp.training.loop import fit
 from scgs_warp.training.round_bodies import RoundBody, find_round_bodies
 from scgs_warp.training.state import TrainState
 from scgs_warp.training.turn_search import CLEARER, LONG, find_turns
@@ -348,3 +351,29 @@ def test_bodies_of_a_few_pixels_are_left_out(monkeypatch):
     for smallest, count in ((0.9 * pixels, 1), (1.1 * pixels, 0)):
         monkeypatch.setattr(round_bodies, "SMALLEST", smallest)
         assert len(find_round_bodies(tracks, np.ones(300, bool), views)) == count
+
+
+def test_a_run_that_is_stopped_while_it_looks_for_turns_repeats_this(tmp_path, monkeypatch):
+    config, data, looked = tiny_config(30, pretrain={"steps": 8}), tiny_dataset(6), []
+
+    def add(state, frames, tell):
+        looked.append(state.step)
+        if len(looked) == 1:
+            signal.raise_signal(signal.SIGINT)
+        tell("looking")
+        with torch.no_grad():
+            state.gaussians.sh_dc += 0.1
+        return "1 round body turns"
+
+    monkeypatch.setattr(loop, "turns_due", lambda state, data: state.step == 20)
+    monkeypatch.setattr(loop, "add_turns", add)
+    with pytest.raises(KeyboardInterrupt):
+        fit(config, data, output=tmp_path / "run")
+    resumed = fit(config, data, output=tmp_path / "run", resume=True).tensors()
+    assert looked == [20, 20]
+    whole = fit(config, data, output=tmp_path / "whole").tensors()
+    assert looked == [20, 20, 20]
+    assert all(torch.equal(resumed[name], whole[name]) for name in whole)
+    for run in ("run", "whole"):
+        lines = (tmp_path / run / "log.jsonl").read_text(encoding="utf-8").splitlines()
+        assert sum("round body" in line for line in lines) == 1
