@@ -20,6 +20,7 @@ from scgs_warp.config.presets import preset
 from scgs_warp.data import load
 from scgs_warp.data.dataset import Dataset
 from scgs_warp.gaussians import gaussians_from_points
+from scgs_warp.storage import checkpoint
 from scgs_warp.training import loop, round_bodies, turns
 from scgs_warp.training.frames import Frames
 from scgs_warp.training.loop import fit
@@ -369,6 +370,7 @@ def test_a_run_that_is_stopped_while_it_looks_for_turns_repeats_this(tmp_path, m
     monkeypatch.setattr(loop, "add_turns", add)
     with pytest.raises(KeyboardInterrupt):
         fit(config, data, output=tmp_path / "run")
+    assert checkpoint.read(tmp_path / "run", ())[1]["step"] == 20
     resumed = fit(config, data, output=tmp_path / "run", resume=True).tensors()
     assert looked == [20, 20]
     whole = fit(config, data, output=tmp_path / "whole").tensors()
