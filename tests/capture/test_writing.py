@@ -59,6 +59,24 @@ def test_the_written_folder_is_read_back_with_identical_cameras(tmp_path, bend):
     assert share_found(train, 0.1) > 0.75
 
 
+@pytest.mark.parametrize("bend, reach", [(0.0, 40), (-0.02, 10), (0.02, 10)])
+def test_pixels_where_the_lens_does_not_distort_stay_as_they_are(tmp_path, bend, reach):
+    """All of them without distortion, else those around the principal point."""
+    picture = np.random.default_rng(0).integers(0, 256, (HEIGHT, WIDTH, 3), np.uint8)
+    for folder in ("frames", "out"):
+        (tmp_path / folder).mkdir()
+    cv2.imwrite(str(tmp_path / "frames/a.png"), picture)
+    found = solved((90.0, 40.0, 30.0, bend), 1)
+    pinhole = writing.undistort(FrameFiles(tmp_path / "frames", ["a.png"], None), found, tmp_path / "out", lambda: None)
+    written = cv2.imread(str(tmp_path / "out/images/a.png"))
+    assert written.shape[:2] == (pinhole.height, pinhole.width)
+    left, top = 40.0 - pinhole.cx, 30.0 - pinhole.cy
+    assert left == int(left) and top == int(top)
+    y, x = np.indices(written.shape[:2])
+    near = np.hypot(x + 0.5 - pinhole.cx, y + 0.5 - pinhole.cy) < reach
+    np.testing.assert_array_equal(written[near], picture[y[near] + int(top), x[near] + int(left)])
+
+
 def test_turned_photographs_do_not_tilt_the_world(tmp_path):
     """Half of them were held the other way; their cameras are turned about the optical axis."""
     found = solved((90.0, 40.0, 30.0, 0.0))
