@@ -5,7 +5,8 @@
 
 Each pixel of a held-out view shows a point of a surface. The point is followed to every frame, and the frames in which
 it is visible are sampled there (bicubic) and averaged, with weights that fall with the angle between the two directions
-of sight as the surface sees them, and with the time between the two. What this picture lacks is not due to errors of
+of sight as the surface sees them, and with the time between the two: quickly, slowly or not at all, whichever is best
+for the film. What this picture lacks is not due to errors of
 shape or motion: texture finer than a pixel, compression, and light that changes while the subject moves.
 
 ``views`` holds, for each held-out view, the PSNR of its pixels that other frames see, of those on the subject and on
@@ -41,8 +42,10 @@ from scgs_warp.storage.files import read_text
 from scgs_warp.storage.json_files import parse_json
 from scgs_warp.types import Camera
 
-ANGLE, SECONDS = 3.0, 0.1
-"""Angle (degrees) and time at which a frame's weight has halved."""
+ANGLE = 3.0
+"""Angle at which a frame's weight has halved, in degrees."""
+SECONDS = (0.1, 1.0, 1e6)
+"""Times at which it has halved."""
 EVERY = 3
 """Stride of the frames of a held-out camera."""
 
@@ -64,7 +67,8 @@ class HeldOut:
         self.hits = stage.hits(posed, picture.camera)
         self.mover, self.hit = stage.moves(self.hits).numpy(), (self.hits.face >= 0).numpy()
         self.sight = sight(stage, posed, self.hits, picture.camera)
-        self.total, self.weight = np.zeros(picture.image.shape), np.zeros(picture.image.shape[:2])
+        self.totals = np.zeros((len(SECONDS), *picture.image.shape))
+        self.weights = np.zeros((len(SECONDS), *picture.image.shape[:2]))
 
     def add(self, stage: Stage, frame: Picture, posed: PosedSurface, length: float) -> None:
         """Add a frame of a film of ``length`` seconds; ``posed`` is everything at its time."""
@@ -78,13 +82,16 @@ class HeldOut:
         cosine = (sight(stage, posed, self.hits, camera) * self.sight).sum(-1).clamp(-1.0, 1.0)
         angle = torch.rad2deg(torch.acos(cosine)).numpy()
         elapsed = (frame.time - self.picture.time) * length
-        weight = seen / ((1.0 + (angle / ANGLE) ** 2) * (1.0 + (elapsed / SECONDS) ** 2))
-        self.total += weight[..., None] * cv2.remap(frame.image, x, y, cv2.INTER_CUBIC)
-        self.weight += weight
+        near, sampled = seen / (1.0 + (angle / ANGLE) ** 2), cv2.remap(frame.image, x, y, cv2.INTER_CUBIC)
+        for total, weights, seconds in zip(self.totals, self.weights, SECONDS):
+            weight = near / (1.0 + (elapsed / seconds) ** 2)
+            total += weight[..., None] * sampled
+            weights += weight
 
-    def scores(self) -> dict[str, float]:
-        seen = self.weight > 0.0
-        given = self.total / np.maximum(self.weight, 1e-12)[..., None]
+    def scores(self, choice: int) -> dict[str, float]:
+        """Compare the means with the picture; ``choice`` is an index of ``SECONDS``."""
+        seen = self.weights[choice] > 0.0
+        given = self.totals[choice] / np.maximum(self.weights[choice], 1e-12)[..., None]
         squares = np.square(given - self.picture.image).mean(2)
         parts = {"psnr": seen, "mover": seen & self.mover, "room": seen & ~self.mover}
         scores = {name: float(-10.0 * np.log10(squares[inside].mean())) for name, inside in parts.items()}
@@ -144,9 +151,18 @@ def main() -> int:
         posed = stage.pose_unlit(frame.time)
         for view in views:
             view.add(stage, frame, posed, shooting.length)
-    scores = [view.scores() for view in views]
-    mean = {name: float(np.mean([score[name] for score in scores])) for name in scores[0] if name != "time"}
-    result = {"film": content, "held_out": options.held_out, **mean, "views": scores}
+    choices = [[view.scores(choice) for view in views] for choice in range(len(SECONDS))]
+    means = [{name: float(np.mean([score[name] for score in scores])) for name in scores[0]} for scores in choices]
+    best = max(range(len(SECONDS)), key=lambda choice: means[choice]["psnr"])
+    mean, scores = means[best], choices[best]
+    del mean["time"]
+    result = {
+        "film": content,
+        "held_out": options.held_out,
+        "halved_after": SECONDS[best],
+        **mean,
+        "views": scores,
+    }
     print(json.dumps(mean, indent=1))
     if options.json:
         origin = {"provenance": "measured", "command": command_line("benchmarks/film_limits.py", sys.argv[1:])}
