@@ -13,7 +13,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 
 from ..errors import UserError
-from .field_reader import FieldReader, check_record
+from .field_reader import FieldReader, check_record, show_value
 from .handles import ONE_FRAME, Handle, Target, Vector3
 from .keyframes import MAX_SECONDS, Keyframe
 from .part_skin import SkinName
@@ -268,6 +268,18 @@ class Edit:
 
     def handle(self, name: str) -> Handle | None:
         return next((handle for handle in self.handles if handle.name == name), None)
+
+
+def given_edit(edit: Any, count: int) -> Edit:
+    """Return an edit that a caller gives for a scene of ``count`` control points.
+
+    Raises:
+        UserError: it is no edit, or names a control point that does not exist.
+    """
+    if not isinstance(edit, Edit):
+        raise UserError(f"edit is {show_value(edit)}; give a scgs_warp.edit.Edit, as session.edit is one")
+    edit.check_nodes(count)
+    return edit
 
 
 def _edit_fields(node: FieldReader) -> dict[str, Any]:

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from ..errors import UserError
 from ..formats.gaussian_ply import write_gaussian_ply
+from ..ops.shapes import given_number, given_whole
 from ..rendering.render import render
 from ..runtime.caller_settings import unaffected_methods
 from ..scene.arguments import clamped_time, given_camera, given_color, given_scalar
@@ -24,7 +25,7 @@ from ..storage.files import write_atomically
 from ..storage.output_folders import make_parent
 from ..types import Camera, Gaussians, Image
 from . import edit_file
-from .document import Edit
+from .document import Edit, given_edit
 from .engine import Engine
 from .field_reader import point_of
 from .graph import ControlGraph, chosen_nodes
@@ -58,8 +59,7 @@ class EditSession(Posing):
         self.engine = Engine(scene)
         self.scene: Scene = self.engine.scene
         self.graph: ControlGraph = self.engine.graph
-        self.edit = edit or Edit()
-        self.edit.check_nodes(len(self))
+        self.edit = Edit() if edit is None else given_edit(edit, len(self))
         self._past: deque[Edit] = deque(maxlen=HISTORY)
         self._future: list[Edit] = []
         self._before_drag: Edit | None = None
@@ -91,9 +91,9 @@ class EditSession(Posing):
         """Replace the edit; undo restores the previous one.
 
         Raises:
-            UserError: the edit names a control point that does not exist.
+            UserError: it is no edit, or names a control point that does not exist.
         """
-        edit.check_nodes(len(self))
+        edit = given_edit(edit, len(self))
         self.release()
         if edit != self.edit:
             self._past.append(self.edit)
@@ -149,16 +149,16 @@ class EditSession(Posing):
 
     def ring(self, nodes: Iterable[int], count: int = 1) -> tuple[int, ...]:
         """Return the nodes and all nodes at most ``count`` edges away from them."""
-        return self.graph.ring(self._nodes(nodes), count)
+        return self.graph.ring(self._nodes(nodes), given_whole("count", count))
 
     def within(self, point: Sequence[float], radius: float, time: float, at: float | None = None) -> tuple[int, ...]:
         """Return the control points within ``radius`` of a point."""
         away = np.linalg.norm(self.node_positions(time, at) - point_of("point", point), axis=1)
-        return tuple(np.flatnonzero(away <= radius).tolist())
+        return tuple(np.flatnonzero(away <= given_number("radius", radius)).tolist())
 
     def pick(self, camera: Camera, x: float, y: float, time: float, at: float | None = None) -> np.ndarray | None:
         """Return the surface point seen at a pixel, [3], world units; None where the background shows."""
-        camera = given_camera(camera)
+        camera, x, y = given_camera(camera), *(given_scalar("a pixel", value, "a number") for value in (x, y))
         image = self.render(camera, time, at)
         column, row = int(math.floor(x)), int(math.floor(y))
         if not (0 <= column < camera.width and 0 <= row < camera.height) or float(image.alpha[row, column]) < 0.5:
@@ -239,7 +239,7 @@ class EditSession(Posing):
     def pin_rest(self, rings: int = 2) -> None:
         """Pin every control point that is more than ``rings`` edges away from all handles."""
         held = {node for handle in self.edit.handles for node in handle.nodes}
-        self._change(pins=self.graph.beyond(held, rings))
+        self._change(pins=self.graph.beyond(held, given_whole("rings", rings)))
 
     def _handle(self, name: str) -> Handle:
         handle = self.edit.handle(name)
@@ -270,6 +270,7 @@ class EditSession(Posing):
 
     def preview(self, edit: Edit) -> None:
         """Replace the edit as part of a drag; ``release`` makes the whole drag one step for undo."""
+        edit = given_edit(edit, len(self))
         if self._before_drag is None:
             self._before_drag = self.edit
         self.edit = edit
@@ -334,7 +335,7 @@ class EditSession(Posing):
 
     def _bend(self, time: float, at: float | None, live: bool, frame: float | None = None) -> NodePose | None:
         time, at = clamped_time(time), None if at is None else given_scalar("at", at, "seconds of the film")
-        frame = self.edit.reach if frame is None else frame
+        frame = self.edit.reach if frame is None else given_number("frame", frame)
         if live and at is None:
             return self.engine.bend_live(self.edit, time, frame=frame)
         return self.engine.bend(self.edit, time, at, frame=frame)

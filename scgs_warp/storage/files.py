@@ -128,6 +128,8 @@ def write_atomically(path: Path, content: bytes) -> None:
     Raises:
         UserError: the disk is full or the folder cannot be written; the old file is intact.
     """
+    if not path.name:
+        raise UserError(f"{path}: is no file name; give one")
     temporary: Path | None = None
     try:
         _remove_leftovers(path)

@@ -269,12 +269,30 @@ def test_mistakes_are_one_line(session):
         (lambda: session.drag("nobody", [1, 0, 0]), "nobody"),
         (lambda: session.add_keyframe(1.0), "handle"),
         (lambda: session.save("/dev/null/edit.json"), "/dev/null"),
+        (lambda: session.save(""), "is no file name"),
+        *((lambda edit=edit: session.apply(edit), "edit is .*give a scgs_warp.edit.Edit") for edit in (None, {}, "x")),
+        (lambda: session.preview({}), "edit is {}"),
+        (lambda: EditSession(session.scene, {}), "edit is {}"),
+        (lambda: session.pick(CAMERA, math.nan, 3, 0.0), "pixel is nan"),
+        (lambda: session.pick(CAMERA, 3, None, 0.0), "pixel is None"),
         *((lambda count=count: session.parts(count), "parts: count is") for count in (0, -1, 2.5, "3", True)),
     ]:
         with pytest.raises(UserError, match=words) as caught:
             make()
         assert "\n" not in str(caught.value)
     assert session.edit == Edit()
+
+
+@pytest.mark.parametrize("bad", ["x", [], None, math.nan, {}])
+def test_numbers_of_another_kind_are_named(session, bad):
+    for make, words in [
+        (lambda: session.ring([1], bad), "count must be a whole number"),
+        (lambda: session.within((0, 0, 0), bad, 0.0), "radius must be a number"),
+        (lambda: session.pin_rest(bad), "rings must be a whole number"),
+        *([] if bad is None else [(lambda: session.node_positions(0.0, frame=bad), "frame must be a number")]),
+    ]:
+        with pytest.raises(ValueError, match=words):
+            make()
 
 
 def test_a_handle_is_renamed_in_targets_and_keyframes(session):
