@@ -57,7 +57,7 @@ def _take(fields: FieldReader, model: EditorModel, parts: PartsTool) -> None:
     region = Region(
         own.choice("kind", ("rings", "brush"), "rings"),
         own.integer("rings", 2, 0, 12),
-        own.number("radius", 0.1, 0.0, MAX_RADIUS),
+        own.number("radius", model.region.radius, 0.0, MAX_RADIUS),
     )
     settings = {
         "region": region,

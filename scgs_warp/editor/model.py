@@ -32,6 +32,10 @@ class Moment:
     """True if the edit is previewed, as during a drag."""
 
 
+BRUSH_EDGES = 2.0
+"""Radius of a new editor's brush, in edges of the control graph."""
+
+
 @dataclass(frozen=True)
 class Region:
     """Extent of a click's selection."""
@@ -56,7 +60,8 @@ class EditorModel:
         self.lock = threading.RLock()
         self.selection: tuple[int, ...] = ()
         self.active: str | None = None
-        self.region = Region()
+        edge = session.graph.edge_length / session.engine.units[1]
+        self.region = Region(radius=float(f"{BRUSH_EDGES * edge:.2g}"))
         self.pin_rings: int | None = 3
         """Number of rings of nodes around a new handle beyond which all nodes are pinned; None: no node is pinned."""
         self.lasts: Any = "motion"

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
+import copy
 import math
 
 import numpy as np
 import pytest
 
 from helpers.editor_models import LEFT, RIGHT, chosen, new_model
-from scgs_warp.edit import Film, Playback, Target
+from scgs_warp.edit import EditSession, Film, Playback, Target
 from scgs_warp.edit.handles import STAY
 from scgs_warp.edit.rotations import from_axis
 from scgs_warp.editor.gizmo_pose import GizmoFrame
 from scgs_warp.editor.model import EditorModel, Moment
 from scgs_warp.errors import UserError
+from scgs_warp.geometry.normalisation import Normalisation
 
 
 @pytest.fixture
@@ -29,6 +31,17 @@ def test_selections_replace_add_and_subtract(model):
     assert model.selection == (1, 5)
     model.select((2,))
     assert model.selection == (2,)
+
+
+def test_a_new_brush_has_the_size_of_the_scene(model):
+    """0.1, whatever the units, covered nothing of a scene in millimetres, and all of one that is small."""
+    near = model.session.within(RIGHT, model.region.radius, 0.0)
+    assert 1 < len(near) < len(model.session) / 2
+    scene = copy.copy(model.session.scene)
+    scene.normalisation = Normalisation(scene.normalisation.centre * 1e3, scene.normalisation.scale / 1e3)
+    larger = EditorModel(EditSession(scene))
+    assert larger.region.radius == pytest.approx(1e3 * model.region.radius)
+    assert larger.session.within(1e3 * np.array(RIGHT), larger.region.radius, 0.0) == near
 
 
 def test_a_drag_is_one_step(model):
