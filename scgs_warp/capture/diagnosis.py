@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from itertools import pairwise
 from typing import NamedTuple
 
 from .features import Links
@@ -28,7 +29,7 @@ less."""
 STANDS_STILL = "the camera stands still, so that nothing tells depth"
 WALK = "film from several places, walking sideways around the scene"
 LONG = 0.05
-"""Share of a film's time, at one end, in which no frame has a camera, above which the user gets a note."""
+"""Share of a film's time in which no frame has a camera, above which the user gets a note."""
 GOOD_SHARE = 0.9
 """Share of registered frames above which the user gets no note."""
 
@@ -130,4 +131,28 @@ def unseen_ends(seconds: Sequence[float], span: tuple[float, float]) -> list[str
     return [
         f"note: no frame {' and '.join(parts)} has a camera, and training guesses the motion there; "
         f"{' '.join(options)} and another --output leave that out"
+    ]
+
+
+def unseen_between(seconds: Sequence[float], without: Sequence[float], span: tuple[float, float]) -> list[str]:
+    """Return a note on the longest time between two frames with a camera, if frames in between should have one.
+
+    Args:
+        seconds: times of the frames with a camera, ascending.
+        without: times of the other picked frames. Where there are none, the film repeats itself, and nothing is lost.
+        span: times of the film's ends.
+    """
+    least = LONG * (span[1] - span[0])
+    gaps = [
+        (after - before, before, after)
+        for before, after in pairwise(seconds)
+        if after - before > least and any(before < second < after for second in without)
+    ]
+    if not gaps:
+        return []
+    _, before, after = max(gaps)
+    end, start = math.ceil(100 * before) / 100, math.floor(100 * after) / 100
+    return [
+        f"note: no frame between seconds {end:g} and {start:g} has a camera, and training guesses the motion there; "
+        f"--end {end:g} or --start {start:g}, with another --output, takes one part"
     ]

@@ -15,7 +15,7 @@ from ..storage.json_files import as_number
 from ..visualization.video import write_png
 from . import bundle_adjustment, features, mapping, moving, pictures, writing
 from .colmap import remove_database
-from .diagnosis import Outcome, notes, too_few, unseen_ends
+from .diagnosis import Outcome, notes, too_few, unseen_between, unseen_ends
 from .features import FrameFiles
 from .folder_content import photographs_left_out
 from .given_masks import read_masks
@@ -80,8 +80,16 @@ def _capture(
     if not before:
         _write(folder, frames, frame_files, solved, request.keep, show)
     if source.video:
-        lines += unseen_ends([frames.seconds[place] for place in solved.places], frames.span)
+        lines += _unseen(frames, solved)
     return CaptureResult(outcome, [*lines, *notes(outcome)], before)
+
+
+def _unseen(frames: PickedFrames, solved: mapping.CameraSolution) -> list[str]:
+    """Tell of the times of a film at which no frame has a camera."""
+    places = set(solved.places)
+    seconds = [second for place, second in enumerate(frames.seconds) if place in places]
+    without = [second for place, second in enumerate(frames.seconds) if place not in places]
+    return unseen_ends(seconds, frames.span) + unseen_between(seconds, without, frames.span)
 
 
 def _enough(request: CaptureRequest, frames: PickedFrames) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from scgs_warp.capture.diagnosis import Outcome, likely_reason, notes, too_few, unseen_ends
+from scgs_warp.capture.diagnosis import Outcome, likely_reason, notes, too_few, unseen_between, unseen_ends
 from scgs_warp.capture.features import Links
 
 LINKS = Links(2000, 300, 1.0, 0.3)
@@ -44,3 +44,11 @@ def test_ends_of_the_film_without_cameras_are_named():
     assert "--start 6 and another" in unseen_ends([6.004, 14.6], (0.0, 14.7))[0]
     assert "--end 4.27 and another" in unseen_ends([2.0, 4.262], (2.0, 9.0))[0]
     assert "--start 3 --end 5 and another" in unseen_ends([3.0, 5.0], (0.0, 9.0))[0]
+
+
+def test_parts_of_a_film_that_do_not_connect_are_told():
+    seconds = [0.0, 1.0, 2.104, 6.048, 7.0]
+    note = unseen_between(seconds, [3.0, 4.0, 5.0, 7.1], (0.0, 8.0))
+    assert "between seconds 2.11 and 6.04 has" in note[0] and "--end 2.11 or --start 6.04, with" in note[0]
+    assert unseen_between(seconds, [], (0.0, 8.0)) == [], "a film that rests has lost nothing"
+    assert unseen_between(seconds, [0.5, 8.0], (0.0, 30.0)) == [], "a short gap, and the end"
