@@ -70,6 +70,16 @@ def test_a_page_follows_its_server(view):
         assert problems == []
 
 
+def test_a_page_says_in_words_that_the_scene_did_not_arrive(view):
+    """Browsers say ``Failed to fetch``."""
+    view.publish(packed(bar_scene(gaussians=300)))
+    with chromium() as browser:
+        page = browser.new_page(viewport={"width": 400, "height": 300})
+        page.route("**/scene", lambda route: route.abort())
+        page.goto(view.server.url)
+        until(lambda: "connection to the server was lost" in page.locator("#message").inner_text())
+
+
 def test_the_scene_needs_the_token_and_may_be_missing(view):
     assert get(view.server.port, "/scene").status == 403
     assert get(view.server.port, "/scene", Cookie=key(view.server)).status == 404

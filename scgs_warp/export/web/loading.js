@@ -63,15 +63,16 @@ async function embeddedScene(count, report) {
   return inflater.finish();
 }
 
-// The bytes at an address.
+// The bytes at an address. Browsers describe a lost connection in words of their own, such as "Failed to fetch".
 async function fetchedScene(address, report) {
-  const response = await fetch(address, { cache: "no-store" });
+  const lost = () => { throw new Error("The connection to the server was lost before the scene had arrived."); };
+  const response = await fetch(address, { cache: "no-store" }).catch(lost);
   if (!response.ok) throw new Error(`The server refuses the scene (${response.status}): ${await response.text()}`);
   const size = Number(response.headers.get("Content-Length")), reader = response.body.getReader();
   const inflater = new Inflater();
   let arrived = 0;
   for (;;) {
-    const { done, value } = await reader.read();
+    const { done, value } = await reader.read().catch(lost);
     if (done) break;
     await inflater.push(value);
     arrived += value.length;

@@ -51,7 +51,7 @@ class Updates {
       if (losses === this.losses) this.shown = version;
       done = true;
     } catch (error) {
-      this.tell(error.message);
+      if (this.wire.open) this.tell(error.message);
     }
     this.loading = false;
     if (done) this.refresh();
