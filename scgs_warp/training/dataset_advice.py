@@ -270,7 +270,10 @@ def _expectation(facts: Survey, compares_depth: bool) -> str:
     if facts.views > 1 or facts.standing:
         return "good views between the cameras at all times: each instant is seen from several sides"
     if facts.turn > JUMPS:
-        return "good views from all around: the camera stands elsewhere at each instant"
+        return (
+            "good views from all around where the motion from one instant to the next is small: the camera stands "
+            "elsewhere at each"
+        )
     if compares_depth:
         return "good views near the camera's path; motion along the line of sight is as good as the depth maps"
     if facts.sweep < LITTLE_PARALLAX:
