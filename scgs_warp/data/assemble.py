@@ -6,7 +6,7 @@ Every file is decoded once, so that a damaged file is reported before training b
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -52,6 +52,12 @@ class FrameRecord:
     """Whether pixels of the image that are not opaque are not valid, instead of transparent."""
     covisible: Path | None = None
     """Mask of what training images show as well; None without one."""
+
+    def anchored(self) -> FrameRecord:
+        """Return the record with absolute paths, which stay valid if the program changes its directory."""
+        mask, covisible = (None if path is None else path.absolute() for path in (self.mask, self.covisible))
+        depth = None if self.depth is None else self.depth._replace(path=self.depth.path.absolute())
+        return replace(self, file=self.file.absolute(), mask=mask, depth=depth, covisible=covisible)
 
 
 @dataclass(frozen=True)
@@ -131,8 +137,8 @@ def assemble(
                 f"{size_text((fact.camera.width, fact.camera.height))}; "
                 "correct mask_path or the lens, give a smaller downscale or drop the frame"
             )
-        read, depth = _reader(record, options), _depth_reader(record, fact)
-        shown = _covisible_reader(record, fact)
+        later = record.anchored()
+        read, depth, shown = _reader(later, options), _depth_reader(later, fact), _covisible_reader(later, fact)
         views.append(StoredFrame(fact.camera, record.time, record.name, read, has_alpha, common, key, depth, shown))
     return Dataset(views, folder=folder, split=split, background=options.background, cache=cache, notes=notes)
 

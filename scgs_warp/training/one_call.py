@@ -70,6 +70,7 @@ def train(
     name = BUILTIN.name if data is None else (data.folder if isinstance(data, Dataset) else Path(data)).resolve().name
     folder = Path(output) if output is not None else Path("runs") / f"{name}-{preset}"
     refuse_early(config, folder, resume)
+    folder = folder.absolute()  # progress may change the directory
     where = chosen_device(device)
     shown = reported(progress) if callable(progress) else nullcontext() if progress else quiet()
     with shown:

@@ -135,6 +135,7 @@ class RunFolder:
         except UserError:
             self.__exit__(None, None, None)
             raise
+        self.path = self.path.absolute()  # the program may change its directory
         return self
 
     def __exit__(

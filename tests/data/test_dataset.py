@@ -5,7 +5,9 @@ from __future__ import annotations
 import dataclasses
 
 import pytest
+import torch
 
+from helpers.dycheck_files import write_dycheck
 from helpers.nerfstudio_files import write
 from helpers.tiny import tiny_dataset
 from scgs_warp.data import load
@@ -20,6 +22,17 @@ def test_a_file_that_goes_away_is_told_when_it_is_needed(tmp_path):
     assert data[0].image is not None
     with pytest.raises(UserError, match=r"f_3\.png: no such image"):
         _ = data[3].image
+
+
+@pytest.mark.parametrize(("split", "read"), [("train", Dataset.depth), ("test", Dataset.covisible)])
+def test_a_relative_folder_is_read_after_the_directory_has_changed(split, read, tmp_path, monkeypatch):
+    write_dycheck(tmp_path / "iphone")
+    (tmp_path / "elsewhere").mkdir()
+    expected = load(tmp_path / "iphone", split)
+    monkeypatch.chdir(tmp_path)
+    data = load("iphone", split, cache_mib=0)
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    assert torch.equal(data[0].image, expected[0].image) and torch.equal(read(data, 0), read(expected, 0))
 
 
 @pytest.mark.parametrize(("count", "most"), [(0, 24), (1, 24), (24, 24), (25, 24), (47, 24), (1000, 24), (5, 1)])
