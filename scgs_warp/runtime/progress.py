@@ -93,6 +93,10 @@ class Progress:
         self.done = start
         self.description = description
         self.fields: dict[str, Any] = {}
+        self.stop: Callable[[], object] | None = None
+        """Called if the function of ``reported`` raises an error, which is then kept; None: the error is raised."""
+        self.raised: BaseException | None = None
+        """Error of the function of ``reported``, for the loop to raise once it has stopped."""
         self._stream = stream
         self._began = time.perf_counter()
         self._start = start
@@ -180,8 +184,15 @@ class _Reported(Progress):
         self.done += n
         self.total = max(self.total, self.done)
         report = _report.get()
-        if report is not None:
+        if report is None or self.raised is not None:
+            return
+        try:
             report(self.description, self.done, self.total)
+        except BaseException as error:
+            if self.stop is None:
+                raise
+            self.raised = error
+            self.stop()
 
     def _print(self, text: str) -> None:
         pass

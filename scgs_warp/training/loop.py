@@ -117,7 +117,7 @@ def fit(
 
         # 3. Train.
         with progress(config.steps, "training", start=state.step) as bar, stop_signals() as stop:
-            folder.tell, frames.interrupted = bar.print, stop.is_set
+            folder.tell, frames.interrupted, bar.stop = bar.print, stop.is_set, stop.set
             try:
                 check_replicas(state)
                 _train(state, frames, folder, test, bar, stop, watcher)
@@ -211,17 +211,19 @@ def _train(
         state.step = done
         state.consistent = True
 
-        # 5. Agree with the other processes on stopping, and on the scene.
+        # 5. Show and log.
+        if watched and watcher is not None:
+            watcher.show(state)
+        for result in results:
+            folder.record(state, result, bar)
+
+        # 6. Agree with the other processes on stopping, and on the scene.
         last = state.step == config.steps
         stopping = _stopping(state, stop)
         if last or stopping or state.step % COMPARE_EVERY == 0:
             check_replicas(state)
 
-        # 6. Show, log, save, stop.
-        if watched and watcher is not None:
-            watcher.show(state)
-        for result in results:
-            folder.record(state, result, bar)
+        # 7. Save, stop.
         if time.monotonic() - saved_at >= config.checkpoint_seconds or last or stopping:
             _finish(state, steps, folder, bar)
             state.save(folder.path)
@@ -306,7 +308,7 @@ def _stop(state: TrainState, bar: Progress) -> NoReturn:
     if state.group is not None:
         state.group.barrier()  # torchrun ends all processes when one has ended: the first must have saved
     bar.print(f"stopped at step {state.step}; the checkpoint is saved, continue with --resume")
-    raise KeyboardInterrupt
+    raise bar.raised or KeyboardInterrupt
 
 
 def _saved(state: TrainState, error: UserError) -> UserError:

@@ -53,7 +53,8 @@ def train(
         steps: total number of steps; every milestone scales with it.
         resume: continue the run in ``output``.
         progress: True shows a bar, and advice on the data; False prints nothing. A function is called as
-            ``progress(work, done, total)`` after each step of each work, for example ("training", 500, 24000).
+            ``progress(work, done, total)`` after each step of each work, for example ("training", 500, 24000). An error
+            that it raises stops the work; a training saves its checkpoint first.
         settings: fields of the configuration by their dotted names, with two underscores for a dot:
             ``motion__nodes=256``, ``data__downscale=2``, ``seed=1``. ``scgs-warp config`` lists them.
 

@@ -12,6 +12,7 @@ import scgs_warp
 from helpers.tiny import tiny_config, tiny_dataset, write_dnerf
 from helpers.torch_settings import SETTINGS
 from scgs_warp.errors import UserError
+from scgs_warp.storage import checkpoint
 from scgs_warp.training.one_call import chosen_device
 
 TINY = {
@@ -48,6 +49,29 @@ def test_a_data_set_in_memory_trains(tmp_path, capsys):
     scene = scgs_warp.train(tiny_dataset(6), output=tmp_path / "run", **TINY)
     assert scene.folder == tmp_path / "run"
     assert scene.step == 60 and "data: 6 frames of 48 x 48" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("last", [25, 60])
+def test_an_error_of_the_progress_function_stops_a_run_that_goes_on(last, tmp_path, monkeypatch):
+    """It is raised once the step is saved; and neither it nor the directory of the program matters to the run."""
+    data, calls = tiny_dataset(6), []
+    monkeypatch.chdir(tmp_path)
+
+    def told(work, done, total):
+        calls.append(done)
+        if done == 10:
+            (tmp_path / "elsewhere").mkdir()
+            monkeypatch.chdir(tmp_path / "elsewhere")
+        if done == last:
+            raise KeyboardInterrupt("enough")
+
+    with pytest.raises(KeyboardInterrupt, match="enough"):
+        scgs_warp.train(data, output="run", progress=told, **TINY)
+    assert calls == list(range(1, last + 1)) and not any((tmp_path / "elsewhere").iterdir())
+    assert checkpoint.read(tmp_path / "run", ())[1]["step"] == last
+    stopped = scgs_warp.train(data, output=tmp_path / "run", progress=False, resume=True, **TINY)
+    whole = scgs_warp.train(data, output=tmp_path / "whole", progress=False, **TINY)
+    assert all(torch.equal(value, stopped.tensors()[name]) for name, value in whole.tensors().items())
 
 
 @pytest.mark.parametrize("setting", SETTINGS)
