@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -39,7 +41,7 @@ def given_color(color: Sequence[float] | Tensor) -> Tensor:
         ValueError: it is not three finite numbers.
     """
     try:
-        held = torch.as_tensor(color, dtype=torch.float32)
+        held = _numbers(color)
     except (TypeError, ValueError, RuntimeError):
         raise ValueError(f"background must be 3 numbers, got {color!r:.80}") from None
     if held.shape != (3,):
@@ -49,7 +51,7 @@ def given_color(color: Sequence[float] | Tensor) -> Tensor:
     return held
 
 
-def given_scalar(name: str, value: float, wanted: str) -> float:
+def given_scalar(name: str, value: float | Tensor, wanted: str) -> float:
     """Return a time or another finite number that a caller gives.
 
     Args:
@@ -58,6 +60,8 @@ def given_scalar(name: str, value: float, wanted: str) -> float:
     Raises:
         UserError: it is no number, or non-finite.
     """
+    if isinstance(value, Tensor):
+        value = value.detach()
     try:
         fits = math.isfinite(value)
     except (TypeError, ValueError, RuntimeError):  # RuntimeError: a tensor of several numbers
@@ -76,9 +80,16 @@ def clamped_time(time: float) -> float:
     return min(max(given_scalar("time", time, "a number from 0 (the first moment) to 1 (the last)"), 0.0), 1.0)
 
 
+def _numbers(value: Any) -> Tensor:
+    """Return a caller's numbers in float32. torch takes no flipped array and none of another byte order, and warns of
+    those that may not be written."""
+    held = np.array(value, np.float32, order="C") if isinstance(value, np.ndarray) else value
+    return torch.as_tensor(held, dtype=torch.float32)
+
+
 def _matrix(name: str, value: Tensor | Sequence[Sequence[float]], size: int) -> Tensor:
     try:
-        held = torch.as_tensor(value, dtype=torch.float32)
+        held = _numbers(value)
     except (TypeError, ValueError, RuntimeError):
         raise ValueError(f"{name} must be a tensor of numbers, got {type(value).__name__}") from None
     if held.shape != (size, size):

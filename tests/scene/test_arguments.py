@@ -36,15 +36,26 @@ def camera(**fields) -> Camera:
     return dataclasses.replace(tiny_camera(0, 4, 24), **fields)
 
 
+def read_only(value: torch.Tensor) -> np.ndarray:
+    array = value.numpy().copy()
+    array.flags.writeable = False
+    return array
+
+
 KINDS = {
     "array": np.asarray,
     "array of float64": lambda value: np.asarray(value, np.float64),
     "float64": lambda value: value.double(),
+    "flipped array": lambda value: np.flip(np.flip(value.numpy()).copy()),
+    "array of another byte order": lambda value: value.numpy().astype(">f4"),
+    "array of objects": lambda value: value.numpy().astype(object),
+    "array that may not be written": lambda value: read_only(value),
     "list": lambda value: value.tolist(),
 }
 
 
 @pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.filterwarnings("error")
 def test_numbers_of_any_kind_give_the_same_picture(drawer, kind):
     plain, changed = camera(), KINDS[kind]
     truth = drawer.render(plain, 0.3, background=(0.5, 0.25, 1.0))
