@@ -6,14 +6,17 @@ is likely to be needed next. A run's results are bit-identical for every size of
 
 from __future__ import annotations
 
+import math
 import threading
 from collections.abc import Callable, Hashable
 from concurrent.futures import Future, ThreadPoolExecutor
+from numbers import Real
 from typing import NamedTuple
 
 from torch import Tensor
 
 from ..config.fields import CACHE_MIB
+from ..errors import UserError
 from ..runtime import addresses, memory
 
 MEMORY_SHARE = 0.5
@@ -41,6 +44,8 @@ class ImageCache:
     """Cache shared by the splits of a run; safe to use from several threads."""
 
     def __init__(self, mib: float = CACHE_MIB) -> None:
+        if not (isinstance(mib, Real) and 0 <= mib < math.inf):
+            raise UserError(f"cache_mib is {mib!r:.80}; give a number of MiB, 0 or more")
         self.budget = min(int(mib * 2**20), int(MEMORY_SHARE * memory.room("cpu")))
         self.used = 0
         self._kept: dict[Hashable, Pixels] = {}

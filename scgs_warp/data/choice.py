@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Sequence
+from numbers import Real
 from pathlib import Path
 from typing import NamedTuple
 
@@ -40,11 +42,14 @@ class Instants(NamedTuple):
 
 def check_choice(options: ReadOptions) -> None:
     """Raise UserError for an invalid choice of frames."""
+    for name, value, example in (("frames", options.frames, "0:300:2"), ("only_cameras", options.only_cameras, "a,b")):
+        if not isinstance(value, str | None):
+            raise UserError(f"{name} is {value!r:.80}; give a text, such as {example!r}")
     _slice(options.frames)
     if options.only_cameras and not _names(options.only_cameras):
         raise UserError(f"--only-cameras {options.only_cameras}: name cameras, separated by commas")
-    if options.min_frames < 0:
-        raise UserError(f"--min-frames {options.min_frames}: give at least 1, or 0 for half of the frames")
+    if not (isinstance(options.min_frames, Real) and 0 <= options.min_frames < math.inf):
+        raise UserError(f"--min-frames {options.min_frames!r:.80}: give at least 1, or 0 for half of the frames")
 
 
 def _slice(text: str) -> slice | None:

@@ -117,7 +117,9 @@ class Dataset(Sequence[Frame]):
         )
 
     def with_cameras(self, cameras: Sequence[Camera]) -> Dataset:
-        """Return the data set with other cameras, one for each frame."""
+        """Return the data set with other cameras, one for each frame; ValueError: there are more or fewer."""
+        if len(cameras) != len(self):
+            raise ValueError(f"cameras must be one for each of the {len(self)} frames, got {len(cameras)}")
         return self._with([dataclasses.replace(entry, camera=camera) for entry, camera in zip(self.entries, cameras)])
 
     def subset(self, indices: Sequence[int]) -> Dataset:

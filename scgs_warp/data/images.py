@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import io
-import math
 import re
 import struct
 import warnings
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
+from numbers import Real
 from pathlib import Path
 from typing import NamedTuple, TypeVar
 
@@ -125,12 +125,12 @@ def parallel_map(work: Callable[[T], R], items: Sequence[T], progress: Callable[
 
 def check_options(downscale: float, resample: str, background: str) -> None:
     """Raise UserError for an invalid option."""
-    if not (isinstance(downscale, (int, float)) and math.isfinite(downscale) and downscale >= 1):
-        raise UserError(f"downscale is {downscale!r}; give a number >= 1 (2 halves width and height)")
-    if resample not in RESAMPLES:
-        raise UserError(f"resample is {resample!r}; give one of {', '.join(RESAMPLES)}")
-    if background not in BACKGROUND_COLORS:
-        raise UserError(f"background is {background!r}; give one of {', '.join(BACKGROUND_COLORS)}")
+    if not (isinstance(downscale, Real) and 1 <= downscale < float("inf")):
+        raise UserError(f"downscale is {downscale!r:.80}; give a number >= 1 (2 halves width and height)")
+    if not isinstance(resample, str) or resample not in RESAMPLES:
+        raise UserError(f"resample is {resample!r:.80}; give one of {', '.join(RESAMPLES)}")
+    if not isinstance(background, str) or background not in BACKGROUND_COLORS:
+        raise UserError(f"background is {background!r:.80}; give one of {', '.join(BACKGROUND_COLORS)}")
 
 
 def reduced_size(width: int, height: int, downscale: float, path: Path) -> tuple[int, int]:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 
+import numpy as np
 import pytest
 import torch
 
@@ -33,6 +35,22 @@ def test_a_relative_folder_is_read_after_the_directory_has_changed(split, read, 
     data = load("iphone", split, cache_mib=0)
     monkeypatch.chdir(tmp_path / "elsewhere")
     assert torch.equal(data[0].image, expected[0].image) and torch.equal(read(data, 0), read(expected, 0))
+
+
+@pytest.mark.parametrize("bad", [math.nan, math.inf, [1], {}, np.zeros(3), object(), -1])
+@pytest.mark.parametrize(
+    "option", ["downscale", "resample", "background", "cache_mib", "frames", "only_cameras", "min_frames"]
+)
+def test_options_of_another_kind_are_named(option, bad, tmp_path):
+    with pytest.raises(UserError, match=f"{option.replace('min_frames', '--min-frames')}.* give "):
+        load(tmp_path, **{option: bad})
+
+
+def test_no_frame_is_lost_for_lack_of_a_camera():
+    data = tiny_dataset(3)
+    for cameras in (data.cameras[:2], data.cameras * 2):
+        with pytest.raises(ValueError, match=f"one for each of the 3 frames, got {len(cameras)}"):
+            data.with_cameras(cameras)
 
 
 @pytest.mark.parametrize(("count", "most"), [(0, 24), (1, 24), (24, 24), (25, 24), (47, 24), (1000, 24), (5, 1)])
