@@ -21,6 +21,8 @@ def check(config: TrainConfig) -> TrainConfig:
     Raises:
         UserError: names the field and the remedy.
     """
+    if not isinstance(config, TrainConfig):
+        raise UserError(f"config is {str(config)[:80]!r}; give a TrainConfig, such as config.presets.preset returns")
     check_sizes(config)
     for name, value, bounds in _numbers(config):
         least, choices = bounds.get("least"), bounds.get("choices")

@@ -17,6 +17,7 @@ import torch
 
 from ..errors import UserError
 from ..motion.static import Static
+from ..ops.shapes import shown
 from ..scene.from_gaussians import with_control_points
 from ..scene.scene import Scene
 from ..types import Gaussians
@@ -78,6 +79,8 @@ class Engine:
     """
 
     def __init__(self, scene: Scene) -> None:
+        if not hasattr(scene, "motion"):
+            raise UserError(f"scene is {shown(scene)}; give a scgs_warp.Scene, such as Scene.load returns")
         if isinstance(scene.motion, Static):
             scene = with_control_points(scene)
         if not hasattr(scene.motion, "apply_pose") or not len(getattr(scene.motion, "positions", ())):

@@ -25,7 +25,7 @@ from ..scene.scene import Scene
 from .density_control import Steps, control_density, density_due, take_step
 from .frames import Frames
 from .multi_view import StepInterrupted, check_replicas, check_share
-from .preflight import refuse_empty_chunks
+from .preflight import refuse_data
 from .process_group import ProcessGroup, ProcessLost
 from .recorded_step import RecordedSteps
 from .resuming import as_begun
@@ -92,11 +92,7 @@ def fit(
     environment.check_device(device)
     check_share(config, group)
     environment.ensure_configured()
-    if data.background != config.data.background:
-        raise UserError(f"{data.folder}: loaded on {data.background}, but data.background is {config.data.background}")
-    if len(data) == 0:
-        raise UserError(f"{data.folder}: the {data.split} split has no frames; nothing to train on")
-    refuse_empty_chunks(config, data.times.tolist())
+    refuse_data(config, data)
 
     # 2. Open the run folder, and start or resume the state.
     folder_type = RunFolder if group is None or group.first else ReadOnlyRunFolder

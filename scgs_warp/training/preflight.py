@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
 from pathlib import Path
 
 from ..config.presets import TrainConfig, to_dict
 from ..config.recorded import with_newer_fields
 from ..config.validation import check
+from ..data.dataset import Dataset
 from ..errors import UserError
 from ..motion.chunks import empty_chunk
+from ..ops.shapes import shown
 from ..storage import checkpoint
 from ..storage.locks import AlreadyLocked, lock_file
 from .resuming import check_same_configuration, check_steps
@@ -77,14 +78,21 @@ def refuse_unwritable(output: Path) -> None:
         raise UserError(f"{output}: cannot be made or written in {nearest}; choose another --output")
 
 
-def refuse_empty_chunks(config: TrainConfig, times: Sequence[float]) -> None:
-    """Refuse chunks of time in which no training frame lies: nothing would train their networks.
+def refuse_data(config: TrainConfig, data: Dataset) -> None:
+    """Refuse frames on which a configuration cannot be trained. In a chunk of time without a training frame, nothing
+    would train the network.
 
     Raises:
-        UserError: names the first of them.
+        UserError: names the data set and the remedy.
     """
+    if not isinstance(data, Dataset):
+        raise UserError(f"data is {shown(data)}; give a data set, such as scgs_warp.data.load returns")
+    if data.background != config.data.background:
+        raise UserError(f"{data.folder}: loaded on {data.background}, but data.background is {config.data.background}")
+    if len(data) == 0:
+        raise UserError(f"{data.folder}: the {data.split} split has no frames; nothing to train on")
     chunks = config.motion.chunks
-    empty = empty_chunk(times, chunks)
+    empty = empty_chunk(data.times.tolist(), chunks)
     if empty is not None:
         span = f"{empty / chunks:.3g} to {(empty + 1) / chunks:.3g}"
         raise UserError(f"motion.chunks is {chunks}; no training frame lies at times {span}: give fewer chunks")

@@ -273,6 +273,7 @@ def test_mistakes_are_one_line(session):
         *((lambda edit=edit: session.apply(edit), "edit is .*give a scgs_warp.edit.Edit") for edit in (None, {}, "x")),
         (lambda: session.preview({}), "edit is {}"),
         (lambda: EditSession(session.scene, {}), "edit is {}"),
+        (lambda: EditSession("runs/figure-quick"), "scene is 'runs/figure-quick'; give a scgs_warp.Scene"),
         (lambda: session.pick(CAMERA, math.nan, 3, 0.0), "pixel is nan"),
         (lambda: session.pick(CAMERA, 3, None, 0.0), "pixel is None"),
         *((lambda count=count: session.parts(count), "parts: count is") for count in (0, -1, 2.5, "3", True)),

@@ -215,6 +215,11 @@ def test_rates_and_thresholds_may_be_zero(field, tmp_path):
 def test_what_cannot_be_trained_or_resumed_is_refused(tmp_path):
     data = tiny_dataset(3)
     config = tiny_config(20)
+    with pytest.raises(UserError, match="data is 'tiny'; give a data set"):
+        fit(config, "tiny", output=tmp_path / "a")  # type: ignore[arg-type]
+    for other in ("cpu", None, {"steps": 3}):
+        with pytest.raises(UserError, match=r"config is .*; give a TrainConfig"):
+            fit(other, data, output=tmp_path / "a")  # type: ignore[arg-type]
     with pytest.raises(UserError, match="no frames"):
         fit(config, type(data)([], folder=Path("empty"), split="train"), output=tmp_path / "a")
     fit(config, data, output=tmp_path / "run")
