@@ -101,3 +101,29 @@ def test_a_pinch_that_begins_on_a_part_changes_the_view(browser, editor):
     assert window.ask("player.orbit.distance") < 0.9 * distance
     until(lambda: window.ask("studio.link.state.unedited && !studio.link.state.undo"))
     window.close()
+
+
+def test_tracks_scroll_under_a_finger(browser, editor):
+    for node in range(8):
+        editor.session.add_handle([node], 0.0, f"handle {node}")
+    window = Window(browser, editor, size={"width": 360, "height": 640}, has_touch=True)
+    window.still()
+    fingers = Touch(window.context, window.page)
+
+    def draw(right: float, down: float) -> None:
+        box = window.page.locator("#tracks").bounding_box()
+        x, y = box["x"] + 0.5 * box["width"], box["y"] + 0.75 * box["height"]
+        fingers.at("touchStart", (x, y))
+        for step in range(1, 6) if right or down else ():
+            fingers.at("touchMove", (x + 0.2 * step * right, y + 0.2 * step * down))
+        fingers.at("touchEnd")
+
+    draw(0, -50)
+    until(lambda: window.page.evaluate("document.getElementById('tracks').scrollTop") > 20)
+    assert window.ask("player.time") == 0, "a finger that scrolls leaves the time"
+    draw(0, 0)
+    until(lambda: window.ask("player.time") > 0.2)
+    tapped = window.ask("player.time")
+    draw(60, 0)
+    until(lambda: window.ask("player.time") > tapped + 0.1)
+    window.close()

@@ -1,6 +1,7 @@
 // The strip below the picture: one track a part or handle, keyframes as diamonds that are dragged, copied and deleted.
 
 const CAMERA = Symbol("camera"); // in place of a handle's name
+const SCRUBS = ["pointerdown", "pointermove", "pointerup"];
 
 class Timeline {
   constructor(player, link, clock) {
@@ -9,10 +10,19 @@ class Timeline {
     this.chosen = null; // { name (null: all), at }
     this.owed = 0; // frames by which arrows still move it
     this.scrubbed = (event) => {
-      if (event.type === "pointerdown") {
+      const { type, currentTarget: lane, clientX, clientY } = event;
+      if (type === "pointerdown") {
         if (event.button !== 0 || event.target.classList.contains("key")) return; // a menu may swallow the release
-        event.currentTarget.setPointerCapture(event.pointerId);
-      } else if (!event.currentTarget.hasPointerCapture(event.pointerId)) return;
+        lane.setPointerCapture(event.pointerId);
+        const scrolls = event.pointerType === "touch" && !lane.classList.contains("ruler");
+        this.finger = scrolls ? [clientX, clientY] : null; // it may be about to scroll the tracks
+        if (scrolls) return;
+      } else if (!lane.hasPointerCapture(event.pointerId)) return;
+      if (type === "pointermove" && this.finger) {
+        const [across, along] = [clientX - this.finger[0], clientY - this.finger[1]].map(Math.abs);
+        if (across <= Math.max(CLICK, along)) return;
+        this.finger = null;
+      }
       clock.play(false);
       player.seek(this.share(event));
     };
@@ -61,7 +71,7 @@ class Timeline {
       const lane = document.createElement("div");
       lane.className = name === null ? "lane ruler" : "lane";
       if (name === null) this.addMarks(lane, state);
-      for (const type of ["pointerdown", "pointermove"]) lane.addEventListener(type, this.scrubbed);
+      for (const type of SCRUBS) lane.addEventListener(type, this.scrubbed);
       for (const frame of state.keyframes) {
         if (name === null || frame.names.includes(name)) lane.append(this.diamond(frame, name, state, text));
       }
@@ -98,7 +108,7 @@ class Timeline {
     title.className = "name";
     title.textContent = "Camera";
     lane.className = "lane";
-    for (const type of ["pointerdown", "pointermove"]) lane.addEventListener(type, this.scrubbed);
+    for (const type of SCRUBS) lane.addEventListener(type, this.scrubbed);
     lane.append(...state.film.views.map((at) => this.diamond({ at }, CAMERA, state, "the camera")));
     return [title, lane];
   }
