@@ -213,13 +213,11 @@ def _train(
         for result in results:
             folder.record(state, result, bar)
 
-        # 6. Agree with the other processes on stopping, and on the scene.
+        # 6. Agree with the other processes on stopping, and on the scene; save, stop.
         last = state.step == config.steps
         stopping = _stopping(state, stop)
         if last or stopping or state.step % COMPARE_EVERY == 0:
             check_replicas(state)
-
-        # 7. Save, stop.
         if time.monotonic() - saved_at >= config.checkpoint_seconds or last or stopping:
             _finish(state, steps, folder, bar)
             state.save(folder.path)
