@@ -103,6 +103,24 @@ def test_a_pinch_that_begins_on_a_part_changes_the_view(browser, editor):
     window.close()
 
 
+def test_points_are_chosen_without_a_keyboard(browser, editor):
+    """Phones have no Shift."""
+    window = Window(browser, editor, has_touch=True)
+    window.still()
+    window.page.keyboard.press("3")
+    window.page.locator("summary", has_text="Control points").click()
+    window.page.get_by_label("A drag").select_option("chooses")
+    x, y = window.part_on_screen(window.lowest_limb())
+    fingers = Touch(window.context, window.page)
+
+    fingers.at("touchStart", (x - 40, y - 40))
+    for corner in ((x + 40, y - 40), (x + 40, y + 40), (x - 40, y + 40)):
+        fingers.at("touchMove", corner)
+    fingers.at("touchEnd")
+    until(lambda: window.ask("studio.link.state.selection.length") > 2)
+    window.close()
+
+
 def test_tracks_scroll_under_a_finger(browser, editor):
     for node in range(8):
         editor.session.add_handle([node], 0.0, f"handle {node}")

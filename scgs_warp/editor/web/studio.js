@@ -3,7 +3,7 @@
 const HINTS = {
   pull: "Drag a part to pull it; drag beside the scene to turn the view. ? shows all keys.",
   turn: "Click a part, then drag a ring to turn it about its joint, or drag the dot in the middle to turn it about another point.",
-  points: "Click to choose control points; Shift and drag: lasso or brush, with Ctrl to remove; drag chosen ones to move them.",
+  points: "Click to choose control points; Shift and drag (Control points > A drag: without Shift): lasso or brush, with Ctrl to remove; drag chosen ones to move them.",
 };
 
 const MOST_SENT = 2e6; // bytes of an edit file; quoted, they fit into one message

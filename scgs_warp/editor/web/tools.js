@@ -9,6 +9,7 @@ class Tools {
     this.lit = -1; // row of the part under the pointer
     this.show = { points: false, graph: false, bones: true, ribbons: false };
     this.local = false; // axes of the rings
+    this.areas = false; // drags choose control points without Shift, which phones have not
     this.pivot = new Pivot(this);
     this.drag = null;
     player.tools = this;
@@ -108,9 +109,10 @@ class Tools {
     if (axis >= 0 && !event.shiftKey) {
       return begin({ kind: "turn", turn: this.gizmo.turn(axis, ...spot), about: this.pivot.place() });
     }
-    if (this.kind === "points" && event.shiftKey) {
+    if (this.kind === "points" && (event.shiftKey || this.areas)) {
       const area = this.state.tool.region === "brush" ? new Brush(this, event) : new Lasso(this, event);
-      return begin({ kind: "area", area, how: event.ctrlKey || event.metaKey ? "subtract" : "add" });
+      const removes = event.ctrlKey || event.metaKey || (this.areas && this.state.tool.combine === "subtract");
+      return begin({ kind: "area", area, how: removes ? "subtract" : "add" });
     }
     const point = this.surface(event);
     if (!point) {
@@ -162,6 +164,12 @@ class Tools {
     if (drag.over) this.finish(drag);
   }
 
+  // A click with the points tool, where drags choose areas.
+  click(event) {
+    const point = this.surface(event);
+    this.link.ask("pick", point ? this.picked({ point }) : { at: this.player.at, how: "replace" });
+  }
+
   picked({ point, how }) {
     return { at: this.player.at, point: this.world(point), how, parts_first: this.kind !== "points" };
   }
@@ -191,6 +199,7 @@ class Tools {
     else if (drag.area) {
       const nodes = drag.area.take(event);
       if (nodes.length) this.link.ask("select", { at: this.player.at, what: "nodes", nodes, how: drag.how });
+      else if (!drag.moved && !event.shiftKey) this.click(event);
       this.stop();
     } else if (!drag.moved) {
       if (drag.kind === "pull") {
