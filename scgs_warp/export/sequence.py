@@ -9,7 +9,8 @@ from pathlib import Path
 
 from ..errors import UserError
 from ..formats.gaussian_files import write_gaussians
-from ..storage.output_folders import holds_only, replace_folder
+from ..storage.files import hidden_beside
+from ..storage.output_folders import check_replaceable, replace_folder
 from ..types import Gaussians
 
 NAME = "frame_{:05d}"
@@ -17,17 +18,9 @@ ENDINGS = {"ply-sequence": ".ply", "sog-sequence": ".sog"}
 """Suffix of the frames of each format."""
 
 
-def check_folder(path: Path) -> None:
-    """Check that a sequence may replace a folder.
-
-    Raises:
-        UserError: it is the current folder or contains it, or it holds other files than an earlier sequence.
-    """
-    path = path.resolve()
-    if Path.cwd().is_relative_to(path):
-        raise UserError(f"--output {path}: is the current folder or contains it; name a new folder")
-    if path.is_dir() and not holds_only(path, r"frame_\d{5,}\.(ply|sog)"):
-        raise UserError(f"{path}: holds other files than a sequence's frames; name a new folder")
+def check_folder(path: Path) -> Path:
+    """Check that a sequence may replace a folder, as :func:`check_replaceable`."""
+    return check_replaceable(path, r"frame_\d{5,}\.(ply|sog)", "a sequence's frames")
 
 
 def write_sequence(
@@ -50,11 +43,10 @@ def write_sequence(
         Frame count.
 
     Raises:
-        UserError: as :func:`check_folder`, or the folder cannot be written.
+        UserError: as :func:`check_replaceable`, or the folder cannot be written.
     """
-    path = path.resolve()  # replace the folder that a link points to, not the link
-    check_folder(path)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
+    path = check_folder(path)
+    temporary = hidden_beside(path, f"{os.getpid()}.part")
     shutil.rmtree(temporary, ignore_errors=True)
     count = 0
     try:

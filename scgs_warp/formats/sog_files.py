@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import UserError
-from ..storage.files import read_bytes, write_and_flush, write_atomically
-from ..storage.output_folders import holds_only, make_parent, replace_folder
+from ..storage.files import hidden_beside, read_bytes, write_and_flush, write_atomically
+from ..storage.output_folders import check_replaceable, make_parent, replace_folder
 from ..storage.safe_paths import inside
 
 META = "meta.json"
@@ -147,9 +147,8 @@ def write_files(path: Path, files: dict[str, bytes]) -> None:
                 archive.writestr(zipfile.ZipInfo(name), content)  # without the time: the same files, the same bytes
         write_atomically(path, stream.getvalue())
         return
-    check_folder(path)
-    folder = path.parent.resolve()
-    temporary = folder.with_name(f".{folder.name}.{os.getpid()}.part")
+    folder = check_folder(path)
+    temporary = hidden_beside(folder, f"{os.getpid()}.part")
     try:
         shutil.rmtree(temporary, ignore_errors=True)
         temporary.mkdir()
@@ -162,14 +161,7 @@ def write_files(path: Path, files: dict[str, bytes]) -> None:
         shutil.rmtree(temporary, ignore_errors=True)
 
 
-def check_folder(path: Path) -> None:
-    """Check that the folder of a ``meta.json`` may be replaced.
-
-    Raises:
-        UserError: it is the current folder or contains it, or it holds other files than those of a SOG.
-    """
-    folder = path.parent.resolve()
-    if Path.cwd().is_relative_to(folder):
-        raise UserError(f"{path}: its folder is the current one or contains it; name a new folder")
-    if folder.is_dir() and not holds_only(folder, rf"{META.replace('.', '[.]')}|({'|'.join(IMAGES)})[.]webp"):
-        raise UserError(f"{folder}: holds other files than {META} and its images; name a new folder")
+def check_folder(path: Path) -> Path:
+    """Check that the folder of a ``meta.json`` may be replaced, as :func:`check_replaceable`."""
+    names = rf"{META.replace('.', '[.]')}|({'|'.join(IMAGES)})[.]webp"
+    return check_replaceable(path.parent, names, f"{META} and its images")

@@ -20,6 +20,8 @@ except ImportError:  # Windows
 
 MAX_TEXT = 2**27
 """Largest text file accepted, in bytes: the poses of 100,000 frames take about half of it."""
+KEPT_CHARACTERS = 50
+"""Number of characters of a name, of up to 4 bytes each, that names of temporary files repeat."""
 
 
 def open_regular(path: Path | str) -> BinaryIO:
@@ -85,10 +87,15 @@ def for_ffmpeg(path: Path) -> str:
     return str(path.absolute())
 
 
+def hidden_beside(path: Path, ending: str) -> Path:
+    """Return a hidden name beside ``path``. It begins with that of ``path``, shortened: names end at 255 bytes."""
+    return path.with_name(f".{path.name[:KEPT_CHARACTERS]}.{ending}")
+
+
 def temporary_of(path: Path) -> Path:
     """Return the temporary name for writing ``path`` in a folder that has one writer. It is fixed, so that killed
     processes leave one file at most."""
-    return path.with_name(f".{path.name}.tmp")
+    return hidden_beside(path, "tmp")
 
 
 def sync_folder(folder: Path) -> None:
@@ -148,14 +155,16 @@ def write_atomically(path: Path, content: bytes) -> None:
                 temporary.unlink(missing_ok=True)
         if not isinstance(error, OSError):
             raise
-        raise UserError(f"{path}: cannot be written ({error.strerror}); the previous file is intact") from error
+        raise UserError(
+            f"{path}: cannot be written ({error.strerror}); make room or give another name, an earlier file is intact"
+        ) from error
     sync_folder(path.parent)
 
 
 def _open_temporary(path: Path) -> tuple[Path, IO[bytes]]:
     """Create a temporary file for ``path`` under a new name, and lock it to show that its writer is alive."""
     while True:
-        temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
+        temporary = hidden_beside(path, f"{secrets.token_hex(4)}.tmp")
         file = open(temporary, "xb")
         try:
             if fcntl is not None:
@@ -173,7 +182,7 @@ def _remove_leftovers(path: Path) -> None:
     """Remove temporary files of ``path`` whose writers were killed; a file that is locked has a writer."""
     if fcntl is None:
         return
-    pattern = re.compile(re.escape(f".{path.name}.") + r"[0-9a-f]{8}\.tmp")
+    pattern = re.compile(re.escape(hidden_beside(path, "").name) + r"[0-9a-f]{8}\.tmp")
     with suppress(OSError):
         names = [entry.name for entry in os.scandir(path.parent) if pattern.fullmatch(entry.name)]
         for left in (path.with_name(name) for name in names):

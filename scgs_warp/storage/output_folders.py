@@ -9,6 +9,7 @@ import shutil
 from pathlib import Path
 
 from ..errors import UserError
+from .files import hidden_beside
 
 OF_SYSTEMS = (".DS_Store", "Thumbs.db", "desktop.ini", ".directory")
 ATTEMPTS = 5
@@ -40,6 +41,25 @@ def holds_only(folder: Path, pattern: str) -> bool:
     return all(re.fullmatch(pattern, path.name) for path in paths_in(folder))
 
 
+def check_replaceable(path: Path, pattern: str, held: str) -> Path:
+    """Check that a folder may be replaced as a whole, or made, and return it with links followed: what a link leads to
+    is replaced, not the link.
+
+    Args:
+        pattern: regular expression of the names that it may hold.
+        held: what these are, for the message.
+
+    Raises:
+        UserError: it is the current folder or contains it, or it holds other files.
+    """
+    folder = Path(os.path.realpath(path))
+    if Path.cwd().is_relative_to(folder):
+        raise UserError(f"{path}: is the current folder or contains it; name a new folder")
+    if folder.is_dir() and not holds_only(folder, pattern):
+        raise UserError(f"{path}: holds other files than {held}; name a new folder")
+    return folder
+
+
 def replace_folder(path: Path, new: Path) -> None:
     """Replace the folder ``path`` by the folder ``new``, and remove the earlier one afterwards.
 
@@ -50,7 +70,7 @@ def replace_folder(path: Path, new: Path) -> None:
     """
     for attempt in range(1, ATTEMPTS + 1):
         try:
-            return _replace(path, new, path.with_name(f".{path.name}.{os.getpid()}.old"))
+            return _replace(path, new, hidden_beside(path, f"{os.getpid()}.old"))
         except OSError as error:  # Another process put its folder there, or took the earlier one away.
             if error.errno not in (errno.ENOTEMPTY, errno.EEXIST, errno.ENOENT) or attempt == ATTEMPTS:
                 raise

@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 
 from ..errors import UserError
-from ..storage.files import for_ffmpeg
-from ..storage.output_folders import holds_only, make_parent, replace_folder
+from ..storage.files import for_ffmpeg, hidden_beside
+from ..storage.output_folders import check_replaceable, make_parent, replace_folder
 
 SUFFIXES = (".mp4", ".gif", "")
 """Suffixes that ``film`` accepts; an empty one stands for a folder of PNGs."""
@@ -52,10 +52,14 @@ def check_path(path: str | Path) -> Path:
     if not suffix and path.exists():
         if not path.is_dir():
             raise UserError(f"{path}: is a file; end the name in .mp4 or .gif, or name a folder")
-        if not holds_only(path, FRAME_PATTERN):
-            raise UserError(f"{path}: holds other files than a film's frames; name a new folder")
+        check_frames(path)
     make_parent(path)
     return path
+
+
+def check_frames(path: Path) -> Path:
+    """Check that the frames of a film may replace a folder, as :func:`check_replaceable`."""
+    return check_replaceable(path, FRAME_PATTERN, "a film's frames")
 
 
 def size_step(path: str | Path) -> int:
@@ -102,7 +106,7 @@ class FilmWriter:
         self.fps = fps
         self.quality = quality
         self.frames = 0
-        self.temporary = path.with_name(f".{path.stem}.{os.getpid()}.part{path.suffix}")
+        self.temporary = hidden_beside(path, f"{os.getpid()}.tmp")
         self._shape: tuple[int, ...] | None = None
 
     def write(self, frame: np.ndarray) -> None:
@@ -238,6 +242,9 @@ def gif_durations(frames: int, fps: float) -> list[int]:
 class _Folder(FilmWriter):
     """Folder of numbered PNGs; the frames of an earlier film are replaced as a whole."""
 
+    def __init__(self, path: Path, fps: float, quality: int) -> None:
+        super().__init__(check_frames(path), fps, quality)
+
     def _open(self, frame: np.ndarray) -> None:
         self.discard()
         self.temporary.mkdir()
@@ -246,8 +253,7 @@ class _Folder(FilmWriter):
         write_png(self.temporary / FRAME_NAME.format(self.frames), frame)
 
     def publish(self) -> None:
-        if self.path.is_dir() and not holds_only(self.path, FRAME_PATTERN):
-            raise UserError(f"{self.path}: holds other files than a film's frames; name a new folder")
+        check_frames(self.path)
         replace_folder(self.path, self.temporary)
 
 

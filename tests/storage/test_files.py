@@ -121,6 +121,13 @@ def test_leftovers_of_killed_writers_are_removed(tmp_path: Path):
     assert left == {"a.json", *names[1:]}
 
 
+def test_the_longest_name_is_written(tmp_path: Path):
+    path = tmp_path / ("ü" * 125 + ".json")
+    for content in (b"one", b"two"):
+        write_atomically(path, content)
+        assert path.read_bytes() == content and list(tmp_path.iterdir()) == [path]
+
+
 def test_a_writer_whose_new_file_is_taken_for_a_leftover_begins_again(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     fcntl: Any = pytest.importorskip("fcntl")
     lock, taken = fcntl.flock, []

@@ -112,6 +112,27 @@ def test_folder_of_pngs_is_lossless_and_replaced_as_a_whole(tmp_path: Path) -> N
     assert [entry.name for entry in tmp_path.iterdir()] == ["film"]
 
 
+def test_frames_follow_links_and_leave_the_current_folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "real").mkdir()
+    (tmp_path / "link").symlink_to("real")
+    for count in (3, 2):
+        write(tmp_path / "link", frames(count, 16, 16))
+        assert (tmp_path / "link").is_symlink() and len(list((tmp_path / "real").iterdir())) == count
+    assert sorted(entry.name for entry in tmp_path.iterdir()) == ["link", "real"]
+    (tmp_path / "here").mkdir()
+    monkeypatch.chdir(tmp_path / "here")
+    for name in (".", "..", "/"):
+        with pytest.raises(UserError, match=r"current folder .*; name a new folder"):
+            check_path(name)
+
+
+@pytest.mark.parametrize("name", ["ü" * 125 + ".mp4", "ü" * 125 + ".gif", "ü" * 127])
+def test_the_longest_names_are_written(tmp_path: Path, name: str) -> None:
+    for _ in range(2):  # the second replaces the first
+        write(tmp_path / name, frames(1, 16, 16))
+        assert [entry.name for entry in tmp_path.iterdir()] == [name]
+
+
 @pytest.mark.parametrize("name", ["film.mp4", "film.gif", "film"])
 def test_a_failure_leaves_nothing(tmp_path: Path, name: str) -> None:
     with pytest.raises(RuntimeError, match="mid-film"):
@@ -189,7 +210,7 @@ def test_earlier_frames_outlive_a_replacement_that_fails(tmp_path: Path, monkeyp
     plain = os.replace
 
     def refuse(source: Path, target: Path) -> None:
-        if Path(target) == folder and "part" in Path(source).name:
+        if Path(target) == folder and Path(source).suffix == ".tmp":
             raise OSError(5, "Input/output error")
         plain(source, target)
 
