@@ -57,13 +57,14 @@ def check(options: Options) -> None:
         UserError: names the option and the remedy.
     """
     from scgs_warp.errors import UserError
-    from scgs_warp.storage.output_folders import make_parent
+    from scgs_warp.storage.output_folders import make_parent, refuse_inputs
 
     if options.also and options.split == "train":
         raise UserError("--also: scores held-out views; leave --split train out")
     if options.json is not None:
         if options.json.is_dir():
             raise UserError(f"--json {options.json}: is a folder; name a file, as {options.json / 'metrics.json'}")
+        refuse_inputs(options.json, [options.lpips_weights], options.run, "--json")
         make_parent(options.json)
 
 

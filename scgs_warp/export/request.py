@@ -10,7 +10,7 @@ from typing import Literal, get_args
 from ..errors import UserError
 from ..formats.sog_files import META, check_folder
 from ..geometry.axes import Axis
-from ..storage.output_folders import make_parent
+from ..storage.output_folders import make_parent, refuse_inputs
 from ..storage.suffixes import longest_suffix
 from ..visualization.video import SLOWEST
 
@@ -205,6 +205,8 @@ def check_request(request: ExportRequest) -> None:
         raise UserError(f"--max-mib {request.max_mib:g}: give more than 0 MiB")
     if request.url and not re.fullmatch(r"https?://[^\s/]+/\S*\.html?", request.url, re.IGNORECASE):
         raise UserError(f"--url {request.url}: give the page's whole address, such as https://example.org/scene.html")
+    points = None if request.points is None else Path(request.points)
+    refuse_inputs(request.output, [request.edit, request.captions, points], request.run)
     check_output(request.output, kind)
 
 

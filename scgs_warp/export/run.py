@@ -280,6 +280,8 @@ def _export_cameras(request: ExportRequest, device: str) -> str:
     folder = settings.get("folder")
     if not isinstance(folder, str) or not Path(folder).is_dir():
         raise UserError(f"{request.run}/config.json: data.folder {folder} is no folder; put it back or correct it")
+    if request.output.exists() and request.output.resolve().parent == Path(folder).resolve():
+        raise UserError(f"--output {request.output}: would overwrite a file of the data set; give another name")
     how = {key: settings[key] for key in IMAGE_SETTINGS if key in settings}
     splits = {split: data.load(folder, split, **how) for split in ("train", "test")}
     splits["train"] = refined(splits["train"], request.run, scene.normalisation) or splits["train"]

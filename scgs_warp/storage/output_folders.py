@@ -6,11 +6,21 @@ import errno
 import os
 import re
 import shutil
+from collections.abc import Iterable
+from contextlib import suppress
 from pathlib import Path
 
 from ..errors import UserError
 from .files import hidden_beside
 
+OF_RUNS = (
+    "config.json",
+    "checkpoint.safetensors",
+    "checkpoint.previous.safetensors",
+    "log.jsonl",
+    "skeleton.json",
+)
+"""Files of a run folder that training or an editing user made, and nothing can make again."""
 OF_SYSTEMS = (".DS_Store", "Thumbs.db", "desktop.ini", ".directory")
 ATTEMPTS = 5
 """Number of attempts to replace a folder that other processes replace at the same time."""
@@ -28,6 +38,24 @@ def make_parent(path: Path) -> None:
             raise PermissionError(13, "Permission denied")
     except OSError as error:
         raise UserError(f"{path.parent}: cannot be written ({error.strerror}); give another output folder") from None
+
+
+def refuse_inputs(path: Path, inputs: Iterable[Path | None], run: Path | None = None, option: str = "--output") -> None:
+    """Refuse to write over what the program reads, or over what a run cannot be opened or continued without.
+
+    Args:
+        inputs: files that are read; None stands for one that is not given.
+        run: folder of the run, or None.
+
+    Raises:
+        UserError: ``path`` is one of these.
+    """
+    of_run = [] if run is None else [run / name for name in OF_RUNS]
+    for given in filter(None, [*inputs, *of_run]):
+        with suppress(OSError):  # one of the two does not exist
+            if path.samefile(given):
+                why = "the run needs it" if given in of_run else "it is read"
+                raise UserError(f"{option} {path}: would be overwritten, and {why}; give another name")
 
 
 def paths_in(folder: Path) -> list[Path]:

@@ -84,6 +84,13 @@ def test_a_run_that_cannot_be_written_is_scored_alone(trained, tmp_path):
     assert json.loads(path.read_text())["psnr"] == json.loads((trained / "metrics.json").read_text())["psnr"]
 
 
+def test_a_file_without_which_the_run_cannot_be_opened_is_not_overwritten(tmp_path):
+    (tmp_path / "config.json").write_text("kept")
+    done = run_app("evaluate", "--run", str(tmp_path), "--json", str(tmp_path / "config.json"))
+    line = f"error: --json {tmp_path}/config.json: would be overwritten, and the run needs it; give another name\n"
+    assert (done.returncode, done.stderr) == (2, line)
+
+
 def test_a_folder_in_place_of_the_file_for_metrics_is_refused_before_the_run_is_read(tmp_path):
     done = run_app("evaluate", "--run", str(tmp_path / "missing"), "--json", str(tmp_path))
     line = f"error: --json {tmp_path}: is a folder; name a file, as {tmp_path / 'metrics.json'}\n"

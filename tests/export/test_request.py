@@ -71,6 +71,17 @@ def test_options_that_cannot_work_are_refused_in_one_line(tmp_path, name, fields
     assert "\n" not in str(caught.value) and list(tmp_path.iterdir()) == []
 
 
+def test_what_an_export_reads_is_not_written_over(tmp_path):
+    for name in ("points.csv", "config.json"):
+        (tmp_path / name).write_text("kept")
+    for name, fields in (
+        ("points.csv", {"format": "tracks", "points": str(tmp_path / "points.csv")}),
+        ("config.json", {"format": "cameras"}),
+    ):
+        with pytest.raises(UserError, match="would be overwritten"):
+            check_request(ExportRequest(tmp_path / name, run=tmp_path, **fields))
+
+
 def test_a_good_request_makes_the_folders_above(tmp_path):
     check_request(ExportRequest(tmp_path / "new" / "a.npz", run=tmp_path, frames=3, fps=5.0))
     assert (tmp_path / "new").is_dir()

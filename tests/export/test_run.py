@@ -18,6 +18,7 @@ from helpers.export_files import columns, documented_player, gltf_arrays, pictur
 from helpers.export_runs import export, moving_run
 from helpers.node_packages import gltf_errors, splat_transform
 from helpers.page_reader import read_page
+from helpers.tiny import write_dnerf
 from scgs_warp.apps import edit as edit_app
 from scgs_warp.apps import export as app
 from scgs_warp.apps import view as view_app
@@ -147,6 +148,19 @@ def test_the_graph_of_an_edit_is_written_with_a_mask_and_its_gaussians_are_refus
     assert "24 control points at 120 instants" in capsys.readouterr().out
     assert app.cli([str(argument) for argument in how]) == 2
     assert "write a film, ply-sequence, 4dgs, tracks or graph" in capsys.readouterr().err
+
+
+def test_the_cameras_of_the_data_set_are_not_written_over(run, tmp_path, capsys):
+    copy, data = shutil.copytree(run, tmp_path / "run"), write_dnerf(tmp_path / "data", 16)
+    settings = json.loads((copy / "config.json").read_text())
+    (copy / "config.json").write_text(json.dumps({**settings, "data": {"folder": str(data)}}))
+    kept = (data / "transforms_train.json").read_bytes()
+    asked = ["--run", str(copy), "--format", "cameras", "--output"]
+    assert app.cli([*asked, str(data / "transforms_train.json")]) == 2
+    assert "transforms_train.json: would overwrite a file of the data set; give another" in capsys.readouterr().err
+    assert (data / "transforms_train.json").read_bytes() == kept
+    export(*asked, data / "transforms.json")
+    assert len(json.loads((data / "transforms.json").read_text())["frames"]) == 11
 
 
 def test_graph_is_valid(run, tmp_path):

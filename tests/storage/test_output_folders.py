@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from scgs_warp.errors import UserError
-from scgs_warp.storage.output_folders import holds_only, make_parent, paths_in, replace_folder
+from scgs_warp.storage.output_folders import holds_only, make_parent, paths_in, refuse_inputs, replace_folder
 
 
 def filled(folder: Path, text: str) -> Path:
@@ -39,6 +39,20 @@ def test_what_file_managers_leave_is_no_content(tmp_path: Path):
     for name in ("0001.png", ".DS_Store", "._0001.png", "Thumbs.db"):
         (tmp_path / name).touch()
     assert paths_in(tmp_path) == [tmp_path / "0001.png"] and holds_only(tmp_path, r"\d+\.png")
+
+
+def test_what_is_read_or_makes_a_run_is_not_written_over(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
+    for name in ("points.csv", "config.json", "metrics.json"):
+        (tmp_path / name).touch()
+    (tmp_path / "link").symlink_to("points.csv")
+    monkeypatch.chdir(tmp_path)
+    for name in ("points.csv", "link", "../" + tmp_path.name + "/points.csv"):
+        with pytest.raises(UserError, match=rf"--output {name}: would be overwritten, and it is read; give another"):
+            refuse_inputs(Path(name), [None, tmp_path / "points.csv"])
+    with pytest.raises(UserError, match=r"--json config.json: would be overwritten, and the run needs it"):
+        refuse_inputs(Path("config.json"), [], tmp_path, "--json")
+    for name in ("metrics.json", "new.csv", "skeleton.json"):  # results can be made again; others do not exist
+        refuse_inputs(Path(name), [tmp_path / "points.csv", tmp_path / "missing.json"], tmp_path)
 
 
 @pytest.mark.parametrize("exists", [False, True])
