@@ -13,6 +13,8 @@ from ..errors import UserError
 from ..runtime import environment
 from ..runtime.provenance import provenance
 from ..scene.scene import Scene
+from ..storage.files import write_atomically
+from ..storage.output_folders import make_parent
 from .editing import edit_rows, pull_rows
 from .gsplat import Peers
 from .memory import resident_mib
@@ -118,8 +120,5 @@ def write(report: dict[str, Any], path: Path) -> None:
     Raises:
         UserError: the file cannot be written.
     """
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_text(json.dumps(report, indent=2, allow_nan=False) + "\n", encoding="utf-8")
-    except OSError as error:
-        raise UserError(f"--json {path}: cannot be written ({error.strerror}); name another file") from error
+    make_parent(path)
+    write_atomically(path, (json.dumps(report, indent=2, allow_nan=False) + "\n").encode())

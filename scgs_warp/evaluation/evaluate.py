@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
 import math
-import os
 import statistics
 from collections.abc import Callable
 from pathlib import Path
@@ -19,6 +17,8 @@ from ..errors import UserError
 from ..scene.frame_colors import FrameColors, apply_color, fitted_color
 from ..scene.scene import Scene
 from ..storage.checkpoint import DISK_FULL
+from ..storage.files import write_atomically
+from ..storage.output_folders import make_parent
 from ..types import Frame
 from ..visualization.figures import contact_sheet, to_bytes
 from ..visualization.video import write_png
@@ -298,12 +298,5 @@ def write_metrics(metrics: dict[str, Any], path: str | Path) -> None:
         UserError: the file cannot be written.
     """
     path = Path(path)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        temporary.write_text(json.dumps(_plain(metrics), indent=2, allow_nan=False) + "\n", encoding="utf-8")
-        os.replace(temporary, path)
-    except OSError as error:
-        with contextlib.suppress(OSError):
-            temporary.unlink()
-        raise UserError(f"{path}: cannot be written ({error.strerror}); give another file") from None
+    make_parent(path)
+    write_atomically(path, (json.dumps(_plain(metrics), indent=2, allow_nan=False) + "\n").encode())
