@@ -14,6 +14,7 @@ from typing import Literal
 from scgs_warp.errors import UserError, is_shortage, one_line
 from scgs_warp.runtime import environment
 from scgs_warp.runtime.standard_streams import prepare_standard_streams
+from scgs_warp.runtime.stop_signals import like_ctrl_c
 from scgs_warp.runtime.torchrun import process_label
 
 Device = Literal["auto", "cpu", "cuda"]
@@ -74,10 +75,12 @@ def spare_libraries() -> None:
 
 
 def run(main: Callable[[list[str] | None], None], args: list[str] | None = None) -> int:
-    """Run an app; a user's mistake gives one line on stderr and status 2, Ctrl-C status 130."""
+    """Run an app; a user's mistake gives one line on stderr and status 2; Ctrl-C, SIGTERM or the closing of the
+    terminal status 130."""
     prepare_standard_streams()
     try:
-        main(args)
+        with like_ctrl_c():
+            main(args)
     except UserError as error:
         _tell(f"error{process_label()}: {one_line(error)}")
         return 2

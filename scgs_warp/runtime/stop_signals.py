@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import signal
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import Any
 
@@ -29,13 +29,41 @@ def stop_signals() -> Iterator[threading.Event]:
             raise KeyboardInterrupt
         asked.set()
 
-    numbers = [signal.SIGINT, signal.SIGTERM]
-    hang_up = getattr(signal, "SIGHUP", None)  # not on Windows
-    if hang_up is not None and signal.getsignal(hang_up) != signal.SIG_IGN:  # under nohup the run continues
-        numbers.append(hang_up)
-    before = {number: signal.signal(number, ask) for number in numbers}
-    try:
+    with _handled([signal.SIGINT, *_others()], ask):
         yield asked
+
+
+@contextmanager
+def like_ctrl_c() -> Iterator[None]:
+    """Let SIGTERM and SIGHUP raise KeyboardInterrupt, as Ctrl-C does, so that unfinished files are removed.
+
+    Further ones have no effect, as in :func:`stop_signals`. Outside the main thread, signals are left alone."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    numbers = _others()
+
+    def end(number: int, frame: Any) -> None:
+        for other in numbers:
+            signal.signal(other, signal.SIG_IGN)
+        raise KeyboardInterrupt
+
+    with _handled(numbers, end):
+        yield
+
+
+def _others() -> list[int]:
+    """Return the signals beside Ctrl-C that end a program."""
+    hang_up = getattr(signal, "SIGHUP", None)  # not on Windows
+    goes_on = hang_up is None or signal.getsignal(hang_up) == signal.SIG_IGN  # under nohup
+    return [signal.SIGTERM] if goes_on else [signal.SIGTERM, hang_up]
+
+
+@contextmanager
+def _handled(numbers: list[int], handler: Callable[[int, Any], Any]) -> Iterator[None]:
+    before = {number: signal.signal(number, handler) for number in numbers}
+    try:
+        yield
     finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+        for number, earlier in before.items():
+            signal.signal(number, earlier)

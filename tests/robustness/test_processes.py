@@ -45,6 +45,35 @@ def test_closed_standard_streams():
     assert start("one_kernel.py", preexec_fn=close_streams).returncode == 0
 
 
+FILM = """
+import os, signal, sys, time
+from pathlib import Path
+import numpy as np
+from scgs_warp.apps.cli import run
+from scgs_warp.visualization.video import film
+
+def main(words):
+    with film(Path(words[0])) as writer:
+        writer.write(np.zeros((16, 16, 3), np.uint8))
+        assert len(os.listdir(".")) == 1
+        os.kill(os.getpid(), getattr(signal, words[1]))
+        time.sleep(60)
+
+sys.exit(run(main, sys.argv[1:]))
+"""
+
+
+@posix
+@pytest.mark.parametrize("name", ["SIGTERM", "SIGHUP"])
+def test_a_program_that_is_ended_removes_what_is_unfinished(tmp_path, name):
+    done = subprocess.run(
+        [sys.executable, "-c", FILM, "frames", name], cwd=tmp_path, env=ENVIRONMENT, timeout=300, capture_output=True,
+        preexec_fn=lambda: signal.signal(signal.SIGHUP, signal.SIG_DFL),
+    )  # fmt: skip
+    assert (done.returncode, done.stderr) == (130, b"interrupted\n")
+    assert list(tmp_path.iterdir()) == []
+
+
 @posix
 def test_files_do_not_take_the_places_of_closed_streams(tmp_path):
     reader, writer = os.pipe()
