@@ -106,8 +106,8 @@ def check(options: Options) -> None:
     if options.output is None:
         raise UserError("--output is missing: name a film (.mp4 or .gif) or a folder for PNGs, or give --live")
     refuse_given(options, ("port", "share"), "belongs to --live; leave it out for a film")
-    if options.frames is not None and options.frames < 1:
-        raise UserError(f"--frames {options.frames}: a film needs at least 1")
+    if options.frames is not None and not 1 <= options.frames <= video.MAX_FRAMES:
+        raise UserError(f"--frames {options.frames}: give 1 to {video.MAX_FRAMES:,}")
     if options.path is not None and (options.target is not None or options.frame != "auto" or options.zoom != 1.0):
         raise UserError(f"--path {options.path}: states the cameras; leave out --frame, --target and --zoom")
     if not 16 <= options.size <= LARGEST_SIDE:

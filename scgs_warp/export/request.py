@@ -12,7 +12,7 @@ from ..formats.sog_files import META, check_folder
 from ..geometry.axes import Axis
 from ..storage.output_folders import make_parent, refuse_inputs
 from ..storage.suffixes import longest_suffix
-from ..visualization.video import SLOWEST
+from ..visualization.video import MAX_FRAMES, SLOWEST
 
 Format = Literal[
     "ply",
@@ -61,7 +61,6 @@ STILL_FORMATS: tuple[Format, ...] = ("ply", "compressed.ply", "splat", "spz", "s
 SEQUENCES = ("ply-sequence", "sog-sequence")
 FRAME_FORMATS = (*SEQUENCES, "tracks", "4dgs")
 """Formats of many moments, which hold the motion of every motion model."""
-MAX_FRAMES = 100_000
 MAX_POINTS = 1_000_000
 MESH_LIMITS = {"faces": (100, 10_000_000), "resolution": (16, 2048)}
 """Smallest and largest value of the options of meshes."""
@@ -197,6 +196,8 @@ def check_request(request: ExportRequest) -> None:
         raise UserError(f"{given}: the film of an edit has its own; {remedy}")
     if request.frames is not None and not 1 <= request.frames <= MAX_FRAMES:
         raise UserError(f"--frames {request.frames}: give 1 to {MAX_FRAMES}")
+    if request.frames == 1 and kind == "4dgs":
+        raise UserError("--frames 1: --format 4dgs needs at least two moments; give --frames 2 or more")
     if request.fps is not None and not SLOWEST <= request.fps <= 1000:
         raise UserError(f"--fps {request.fps:g}: give {SLOWEST} to 1000 frames a second")
     _check_unused(request)

@@ -37,9 +37,10 @@ def turntable(
         raise UserError(f"{told}: give whole numbers of frames and pixels, and numbers") from None
     if time is not None and not 0.0 <= time <= 1.0:
         raise UserError(f"time {time:g}: give a time from 0 to 1")
-    if frames < 1 or not 16 <= size <= 8192 or not video.SLOWEST <= fps <= 1000:
+    if not 1 <= frames <= video.MAX_FRAMES or not 16 <= size <= 8192 or not video.SLOWEST <= fps <= 1000:
         raise UserError(
-            f"frames {frames}, size {size}, fps {fps:g}: give at least 1, 16 to 8192, and {video.SLOWEST} to 1000"
+            f"frames {frames}, size {size}, fps {fps:g}: give 1 to {video.MAX_FRAMES:,}, 16 to 8192, and "
+            f"{video.SLOWEST} to 1000"
         )
     path_cameras = cameras.turntable(framed(scene), frames, size, step=video.size_step(target))
     last = max(frames - 1, 1)

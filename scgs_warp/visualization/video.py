@@ -31,6 +31,8 @@ GIF_PIXEL_BYTES = 4
 SLOWEST = 0.01
 """Least number of frames a second. A GIF's frame lasts at most 655 seconds, and an MP4's rate is a fraction with a
 denominator of at most 1,000."""
+MAX_FRAMES = 100_000
+"""Largest number of frames that can be asked for: an hour of film, or its cameras, which are all made at first."""
 FASTEST_GIF = 50
 """Largest number of frames a second of a GIF: browsers slow down what changes after less than 2 hundredths of one."""
 FRAME_NAME = "frame_{:05d}.png"

@@ -115,6 +115,7 @@ def test_trails_without_control_points_follow_gaussians(monkeypatch, tmp_path) -
     "arguments, words",
     [
         (["--frames", "0"], "--frames 0"),
+        (["--frames", "1000000000"], "--frames 1000000000: give 1 to 100,000"),
         (["--size", "15"], "--size 15"),
         (["--fps", "0"], "--fps 0"),
         (["--time", "1.5"], "--time 1.5"),

@@ -51,6 +51,7 @@ def test_a_glb_is_still_where_an_instant_is_given():
         ("a.ply", {"at": 1.0}, "--at 1"),
         ("a.ply", {"frames": 3}, "--frames"),
         ("a.npz", {"frames": 0}, "--frames 0"),
+        ("a.4dgs", {"frames": 1}, "--frames 1: --format 4dgs needs at least two moments"),
         ("a.npz", {"fps": float("nan")}, "--fps nan"),
         ("a.npz", {"title": "x"}, "--title"),
         ("a.html", {"max_mib": 0.0}, "--max-mib 0"),
@@ -72,14 +73,14 @@ def test_options_that_cannot_work_are_refused_in_one_line(tmp_path, name, fields
 
 
 def test_what_an_export_reads_is_not_written_over(tmp_path):
-    for name in ("points.csv", "config.json"):
+    for name in ("points.csv", "config.json", "a.ply"):
         (tmp_path / name).write_text("kept")
     for name, fields in (
         ("points.csv", {"format": "tracks", "points": str(tmp_path / "points.csv")}),
         ("config.json", {"format": "cameras"}),
     ):
         with pytest.raises(UserError, match="would be overwritten"):
-            check_request(ExportRequest(tmp_path / name, run=tmp_path, **fields))
+            check_request(ExportRequest(tmp_path / name, **{"run": tmp_path, **fields}))
 
 
 def test_a_good_request_makes_the_folders_above(tmp_path):
