@@ -103,6 +103,7 @@ def check(options: Common) -> None:
         UserError: names the option and the remedy.
     """
     from scgs_warp.config.presets import MotionConfig
+    from scgs_warp.storage.output_folders import refuse_inputs
 
     run, against = getattr(options, "run", None), getattr(options, "against", None)
     for name in ("gaussians", "nodes", "motion", "table_s2"):
@@ -119,6 +120,8 @@ def check(options: Common) -> None:
         raise UserError(f"--gaussians {gaussians}: give at least as many as there are control points ({nodes})")
     if not 0 <= options.seconds <= 600:
         raise UserError(f"--seconds {options.seconds:g}: give 0 to 600")
+    if options.json is not None:
+        refuse_inputs(options.json, [], run, "--json")
     if against is not None and not isinstance(options, Raster):
         raise UserError(f"--against {against}: it has no motion and no training step; compare with raster")
 

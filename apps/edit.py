@@ -79,6 +79,7 @@ def check(options: Options) -> None:
     from scgs_warp.config.bounds import MOST_NODES
     from scgs_warp.errors import UserError
     from scgs_warp.export.request import STILL_FORMATS, SUFFIXES, Format, check_output, output_suffix
+    from scgs_warp.storage.output_folders import refuse_inputs
     from scgs_warp.visualization import video
 
     if (options.run is None) == (options.ply is None):
@@ -115,6 +116,7 @@ def check(options: Options) -> None:
     if options.output is not None:
         video.check_path(options.output)
     if options.export is not None:
+        refuse_inputs(options.export, [options.ply, options.motion], option="--export")
         check_output(options.export, kinds[output_suffix(options.export)], "--export")
 
 

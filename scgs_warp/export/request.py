@@ -207,7 +207,7 @@ def check_request(request: ExportRequest) -> None:
     if request.url and not re.fullmatch(r"https?://[^\s/]+/\S*\.html?", request.url, re.IGNORECASE):
         raise UserError(f"--url {request.url}: give the page's whole address, such as https://example.org/scene.html")
     points = None if request.points is None else Path(request.points)
-    refuse_inputs(request.output, [request.edit, request.captions, points], request.run)
+    refuse_inputs(request.output, [request.ply, request.edit, request.captions, points], request.run)
     check_output(request.output, kind)
 
 

@@ -98,6 +98,13 @@ def test_mistakes_are_one_line_and_status_2(tmp_path, monkeypatch, capsys, argum
     assert list(tmp_path.iterdir()) == []
 
 
+def test_an_export_does_not_replace_the_file_that_is_edited(ply, capsys):
+    before = ply.read_bytes()
+    assert app.cli(["--ply", str(ply), "--script", "x", "--export", str(ply)]) == 2
+    assert f"--export {ply}: would be overwritten, and it is read; give another name" in capsys.readouterr().err
+    assert ply.read_bytes() == before
+
+
 def test_the_skeleton_is_printed(monkeypatch, capsys):
     from scgs_warp.edit import EditSession
 

@@ -78,6 +78,7 @@ def test_what_an_export_reads_is_not_written_over(tmp_path):
     for name, fields in (
         ("points.csv", {"format": "tracks", "points": str(tmp_path / "points.csv")}),
         ("config.json", {"format": "cameras"}),
+        ("a.ply", {"run": None, "ply": tmp_path / "a.ply"}),
     ):
         with pytest.raises(UserError, match="would be overwritten"):
             check_request(ExportRequest(tmp_path / name, **{"run": tmp_path, **fields}))
