@@ -8,7 +8,7 @@ import threading
 
 import pytest
 
-from scgs_warp.runtime.stop_signals import stop_signals
+from scgs_warp.runtime.stop_signals import like_ctrl_c, stop_signals
 
 SIGNALS = [getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name)]
 
@@ -39,6 +39,21 @@ def test_a_second_interrupt_ends_the_process():
         assert asked.wait(5)
         os.kill(os.getpid(), signal.SIGINT)
         asked.wait(5)
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals of this kind are of POSIX")
+@pytest.mark.parametrize("number", SIGNALS[1:])
+def test_a_signal_is_taken_for_ctrl_c_once(number: int):
+    before = signal.signal(number, signal.SIG_DFL)  # the tests themselves may run under nohup
+    try:
+        with pytest.raises(KeyboardInterrupt, match="^$"), like_ctrl_c():
+            try:
+                os.kill(os.getpid(), number)
+            finally:
+                os.kill(os.getpid(), number)  # it comes again while files are removed
+        assert signal.getsignal(number) is signal.SIG_DFL
+    finally:
+        signal.signal(number, before)
 
 
 def test_other_threads_leave_signals_alone():
