@@ -303,7 +303,7 @@ def test_folders_of_others_are_not_replaced(tmp_path, monkeypatch):
         write_still(folder / META, cloud(10))
     assert [p.name for p in folder.iterdir()] == ["notes.txt"]
     monkeypatch.chdir(folder)
-    with pytest.raises(UserError, match="is the current one"):
+    with pytest.raises(UserError, match="is the current folder"):
         write_still(Path(META), cloud(10))
     write_still(tmp_path / "new" / META, cloud(10))
     write_still(tmp_path / "new" / META, cloud(20, 0))  # what is there is replaced as a whole

@@ -46,7 +46,7 @@ def test_a_second_interrupt_ends_the_process():
 def test_a_signal_is_taken_for_ctrl_c_once(number: int):
     before = signal.signal(number, signal.SIG_DFL)  # the tests themselves may run under nohup
     try:
-        with pytest.raises(KeyboardInterrupt, match="^$"), like_ctrl_c():
+        with pytest.raises(KeyboardInterrupt), like_ctrl_c():
             try:
                 os.kill(os.getpid(), number)
             finally:
