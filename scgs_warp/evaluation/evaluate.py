@@ -6,6 +6,7 @@ import json
 import math
 import statistics
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -94,6 +95,7 @@ class _Renders:
         self.folder, self._background = folder, background
         rows = min(SHEET_ROWS, count)
         self._chosen = {round(index * (count - 1) / max(rows - 1, 1)) for index in range(rows)}
+        self._names: set[str] = set()
         self._rows: list[tuple[Any, Any]] = []
         self._titles: list[str] = []
         self._scores: list[float] = []
@@ -106,6 +108,7 @@ class _Renders:
 
     def add(self, row: dict[str, Any], index: int, frame: Frame, image: Tensor, alpha: Tensor, truth: Tensor) -> None:
         name, score = row["name"], row["psnr"]
+        self._names.add(f"{name}.png")
         pair = to_bytes(truth), to_bytes(image)
         self._write(self.folder / "truth" / f"{name}.png", pair[0])
         self._write(self.folder / "renders" / f"{name}.png", pair[1])
@@ -120,6 +123,12 @@ class _Renders:
             self._titles.append(f"{name}   t = {frame.time:.3f}")
 
     def finish(self) -> None:
+        """Write the contact sheet, and remove pictures of frames that an earlier evaluation had and this one has not:
+        programs that score folders of pictures would count them."""
+        for path in [*(self.folder / "renders").glob("*.png"), *(self.folder / "truth").glob("*.png")]:
+            if path.name not in self._names:
+                with suppress(OSError):
+                    path.unlink()
         if self._rows:
             more = {"scores": self._scores, "alphas": self._alphas, "background": self._background}
             self._write(self.folder / "contact_sheet.png", contact_sheet(self._rows, self._titles, **more))

@@ -144,6 +144,15 @@ def test_each_frame_has_a_file_of_its_own(tmp_path: Path) -> None:
         assert sorted(path.stem for path in (tmp_path / "made" / kind).iterdir()) == sorted(listed)
 
 
+def test_pictures_of_an_earlier_evaluation_do_not_stay_among_the_new_ones(tmp_path: Path) -> None:
+    scene = FakeScene()
+    for count in (3, 2):
+        evaluate(scene, fake_dataset(scene, count), render_dir=tmp_path)
+        (tmp_path / "renders" / "notes.txt").touch()
+    assert sorted(path.name for path in (tmp_path / "truth").iterdir()) == ["r_000.png", "r_001.png"]
+    assert sorted(path.name for path in (tmp_path / "renders").iterdir()) == ["notes.txt", "r_000.png", "r_001.png"]
+
+
 def test_an_image_that_equals_the_truth_counts_as_a_hundred_decibels() -> None:
     """A view beside the subject shows the background alone; infinity would be the mean of all images."""
     scene = FakeScene()
