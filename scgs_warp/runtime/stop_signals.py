@@ -55,8 +55,9 @@ def like_ctrl_c() -> Iterator[None]:
 def _others() -> list[int]:
     """Return the signals beside Ctrl-C that end a program."""
     hang_up = getattr(signal, "SIGHUP", None)  # not on Windows
-    goes_on = hang_up is None or signal.getsignal(hang_up) == signal.SIG_IGN  # under nohup
-    return [signal.SIGTERM] if goes_on else [signal.SIGTERM, hang_up]
+    if hang_up is None or signal.getsignal(hang_up) == signal.SIG_IGN:  # under nohup the program continues
+        return [signal.SIGTERM]
+    return [signal.SIGTERM, hang_up]
 
 
 @contextmanager
