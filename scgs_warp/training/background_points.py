@@ -12,7 +12,7 @@ from torch import Tensor
 from ..data.dataset import spread
 from ..geometry.normalisation import Normalisation
 from ..runtime.search_tree import search_tree
-from ..seeding import generator
+from ..seeding import Purpose, generator
 from ..types import Camera, Frame
 
 MOST_VIEWS = 100
@@ -45,7 +45,7 @@ def _valid_cells(count: int, frame: Frame, random: torch.Generator) -> Tensor:
 
 
 def background_points(
-    count: int, points: Tensor, data: Sequence[Frame], normalisation: Normalisation, seed: int, key: int
+    count: int, points: Tensor, data: Sequence[Frame], normalisation: Normalisation, seed: int
 ) -> tuple[Tensor, Tensor]:
     """Place points on random rays through the images, with the colours of their pixels.
 
@@ -69,7 +69,7 @@ def background_points(
         known, depths = _project(points.cpu(), camera)
         if share == 0 or len(known) == 0:
             continue
-        random = generator(seed, key, ray_set)
+        random = generator(seed, Purpose.BACKGROUND_POINTS, ray_set)
         cells = _valid_cells(share, frame, random)
         if len(cells) == 0:
             continue
@@ -83,5 +83,5 @@ def background_points(
         colors.append(frame.image[rows, columns])
     if not positions:
         return torch.zeros(0, 3), torch.zeros(0, 3)
-    order = torch.randperm(sum(map(len, positions)), generator=generator(seed, key, len(chosen)))
+    order = torch.randperm(sum(map(len, positions)), generator=generator(seed, Purpose.BACKGROUND_POINTS, len(chosen)))
     return torch.cat(positions)[order], torch.cat(colors)[order]

@@ -19,7 +19,7 @@ from ..geometry.optical_flow import targets_of
 from ..geometry.view_rays import pixels_of, ray_of
 from ..runtime.progress import progress
 from ..runtime.search_tree import search_tree
-from ..seeding import generator
+from ..seeding import Purpose, generator
 from .depth import Depths, FrameDepths, SeenDepth
 from .flow import Flows
 from .flow_points import LEAST_REGION, InstantPoints, colors_at, strays
@@ -50,19 +50,15 @@ GHOST = 3.0
 """Distance to a moving point, in distances between neighbouring ones, up to which a sparse point lies on what moves."""
 
 
-def depth_clouds(count: int, data: Dataset, flows: Flows, depths: Depths, seed: int, key: int) -> list[InstantPoints]:
-    """Find up to ``count`` moving points at each of several moments; moments without enough are left out.
-
-    Args:
-        key: of the random choice.
-    """
+def depth_clouds(count: int, data: Dataset, flows: Flows, depths: Depths, seed: int) -> list[InstantPoints]:
+    """Find up to ``count`` moving points at each of several moments; moments without enough are left out."""
     found = []
     ordered = sorted(data.with_depth, key=lambda index: data.entries[index].time)
     chosen = [ordered[each] for each in spread(len(ordered), MOST_MOMENTS)]
     later: list[Tensor | None] = []
     with progress(2 * len(chosen), "depth of what moves") as bar:
         for index in chosen:
-            found.append(_cloud(index, count, data, flows, depths, seed, key))
+            found.append(_cloud(index, count, data, flows, depths, seed))
             bar.advance()
         moving = [number for _, number in found if number >= FEWEST]
         least = max(FEWEST, ENOUGH * float(np.median(moving or [0])))
@@ -82,9 +78,7 @@ class FramePoints(NamedTuple):
     """With the pixels."""
 
 
-def _cloud(
-    index: int, count: int, data: Dataset, flows: Flows, depths: Depths, seed: int, key: int
-) -> tuple[FramePoints, int]:
+def _cloud(index: int, count: int, data: Dataset, flows: Flows, depths: Depths, seed: int) -> tuple[FramePoints, int]:
     """Find the moving points of a frame, up to ``count`` of them, chosen at random; and the number of all."""
     seen = depths.of(index)
     assert seen is not None, "asked for frames with a depth map only"
@@ -93,7 +87,7 @@ def _cloud(
     moves = _region(pixels, *_moves(index, points, pixels, flows), inverse)
     moves[moves] = ~strays(points[moves])
     every = moves.nonzero()[0]
-    kept = every[torch.randperm(len(every), generator=generator(seed, key, index))[:count].numpy()]
+    kept = every[torch.randperm(len(every), generator=generator(seed, Purpose.MOVING_POINTS, index))[:count].numpy()]
     colors = colors_at(data[index].image, pixels[kept], (inverse.shape[1], inverse.shape[0]))
     cloud = seen_points(index, points[kept], colors, data.entries[index].time, pixels[kept])
     return FramePoints(index, cloud), len(every)

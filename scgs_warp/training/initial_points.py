@@ -59,11 +59,11 @@ def initial_points(config: TrainConfig, data: Dataset, normalisation: Normalisat
 def _at_random(count: int, config: TrainConfig, data: Dataset, normalisation: Normalisation) -> InitialPoints:
     """Draw points where the images are covered; with ``init_random`` cube, grey ones in a cube."""
     if config.init_random == "cube":
-        points, colors = random_points(count, config.seed, Purpose.RANDOM_POINTS), None
+        points, colors = random_points(count, config.seed), None
     else:
         # Spheres that start in the pose of the first frames are sampled from these frames only.
         frames = first_frames(data) if starts_in_first_pose(config) and config.pretrain_steps else data
-        points, colors = sample_initial_points(count, frames, normalisation, config.seed, Purpose.RANDOM_POINTS)
+        points, colors = sample_initial_points(count, frames, normalisation, config.seed)
     colors = torch.full_like(points, 0.5) if colors is None else colors
     return InitialPoints(points, colors, torch.zeros(len(points), dtype=torch.bool))
 
@@ -89,13 +89,13 @@ def _of_data(
         known, room = points[keep], used - len(seen.points)
         points, colors = torch.cat([known[:room], seen.points]), torch.cat([colors[keep][:room], seen.colors])
         moves = torch.cat([moves[keep][:room], seen.moves])
-    behind = background_points(count - len(points), known, data, normalisation, config.seed, Purpose.BACKGROUND_POINTS)
+    behind = background_points(count - len(points), known, data, normalisation, config.seed)
     return InitialPoints(torch.cat([points, behind[0]]), torch.cat([colors, behind[1]]), moves, motion, stereo)
 
 
-def random_points(count: int, seed: int, key: int) -> Tensor:
+def random_points(count: int, seed: int) -> Tensor:
     """Draw points [count, 3] uniformly in the cube, normalised units."""
-    return (torch.rand(count, 3, generator=generator(seed, key)) * 2.0 - 1.0) * HALF_SIZE
+    return (torch.rand(count, 3, generator=generator(seed, Purpose.RANDOM_POINTS)) * 2.0 - 1.0) * HALF_SIZE
 
 
 class Coverage(NamedTuple):
@@ -146,19 +146,19 @@ def common_view(points: Tensor, data: Dataset, normalisation: Normalisation) -> 
 
 
 def sample_initial_points(
-    count: int, data: Dataset, normalisation: Normalisation, seed: int, key: int
+    count: int, data: Dataset, normalisation: Normalisation, seed: int
 ) -> tuple[Tensor, Tensor | None]:
     """Draw random points where the images are covered or, if no frame has alpha, where the cameras' views overlap.
 
     Returns:
         points [count, 3], normalised, and colours [count, 3]; the colours are None if no frame has alpha.
     """
-    candidates = random_points(max(CANDIDATES, count), seed, key)
+    candidates = random_points(max(CANDIDATES, count), seed)
     covered = coverage(candidates, data, normalisation)
     share = common_view(candidates, data, normalisation) if covered is None else covered.share
     if not bool((share > 0).any()):
         return candidates[:count], None
-    random = generator(seed, key, 1)
+    random = generator(seed, Purpose.RANDOM_POINTS, 1)
     chosen = torch.multinomial(share**SHARPNESS, count, replacement=True, generator=random)
     spacing = 2.0 * HALF_SIZE / len(candidates) ** (1 / 3)  # the same candidate may be drawn twice
     points = candidates[chosen] + spacing * (torch.rand(count, 3, generator=random) - 0.5)

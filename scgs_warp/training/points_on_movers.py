@@ -9,7 +9,6 @@ from torch import Tensor
 
 from ..data.dataset import Dataset
 from ..geometry.normalisation import FEWEST_POINTS, Normalisation
-from ..seeding import Purpose
 from ..types import Camera
 from .depth import Depths
 from .depth_points import depth_clouds, on_movers
@@ -56,7 +55,7 @@ def points_on_movers(
     if stereo is not None:
         most = min(most, int(SHARE * count))
         flows = Flows(data, views)
-        clouds = stereo_clouds(stereo, flows, most, seed, Purpose.MOVING_POINTS)
+        clouds = stereo_clouds(stereo, flows, most, seed)
         found, motion = _gathered(clouds, most, seed, Registration(data, flows, stereo, stereo.frame_then))
         if found is not None:
             keep = _kept(known, torch.from_numpy(~moving_points(known.double().numpy(), stereo.standing)))
@@ -83,7 +82,7 @@ def _by_depth(
     depths = Depths(data, views, scale)
     depths.read()
     flows = Flows(data, views)
-    clouds = depth_clouds(most, data, flows, depths, seed, Purpose.MOVING_POINTS)
+    clouds = depth_clouds(most, data, flows, depths, seed)
     frames = {cloud.time: int(cloud.frames[0]) for cloud in clouds if cloud.frames is not None}
     registration = Registration(data, flows, depths, lambda _, time: frames.get(time))
     return _gathered(clouds, most, seed, registration)
@@ -96,5 +95,5 @@ def _gathered(
     if not clouds:
         return None, None
     start = [cloud.time for cloud in clouds].index(start_cloud(clouds).time)
-    found, tracks = gather(clouds, start, most, seed, Purpose.MOVING_POINTS, registration)
+    found, tracks = gather(clouds, start, most, seed, registration)
     return found, None if found is None else SeenMotion(found, clouds, tracks)

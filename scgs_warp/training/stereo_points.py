@@ -14,7 +14,7 @@ import torch
 
 from ..data.dataset import spread
 from ..runtime.progress import progress
-from ..seeding import generator
+from ..seeding import Purpose, generator
 from .depth_points import FramePoints, later_places, points_of, seen_points
 from .flow import Flows
 from .flow_points import InstantPoints, colors_at, strays
@@ -46,19 +46,15 @@ def moving_points(
     return (seen >= 2) & (still <= seen // SEEING_PER_BLIND)
 
 
-def stereo_clouds(stereo: StereoDepths, flows: Flows, count: int, seed: int, key: int) -> list[InstantPoints]:
+def stereo_clouds(stereo: StereoDepths, flows: Flows, count: int, seed: int) -> list[InstantPoints]:
     """Find up to ``count`` moving points at each of several moments, from the first to the last; moments without enough
-    are left out.
-
-    Args:
-        key: of the random choice.
-    """
+    are left out."""
     if sum(bool(one.moves.any()) for one in stereo.standing) < 2:
         return []
     found: list[dict[int, FramePoints]] = []
     with progress(2 * len(stereo.moments), "points of what moves") as bar:
         for time in stereo.moments:
-            found.append(_moment(time, stereo, count, seed, key))
+            found.append(_moment(time, stereo, count, seed))
             bar.advance()
         sizes = [sum(len(each.cloud.points) for each in moment.values()) for moment in found]
         least = max(float(FEWEST), ENOUGH * max(sizes, default=0))
@@ -93,7 +89,7 @@ def _followed(
     return {able[place]: following[able[place]] for place in spread(len(able), max(2, most))}
 
 
-def _moment(time: float, stereo: StereoDepths, count: int, seed: int, key: int) -> dict[int, FramePoints]:
+def _moment(time: float, stereo: StereoDepths, count: int, seed: int) -> dict[int, FramePoints]:
     """Find the moving points of a moment, up to ``count`` of them, chosen at random, by the number of the camera."""
     here = stereo.frames_at(time)
     views = [stereo.standing[number] for number in here]
@@ -111,7 +107,7 @@ def _moment(time: float, stereo: StereoDepths, count: int, seed: int, key: int) 
         frames.append(np.full(int(moves.sum()), index))
     every, owners = np.concatenate(points), np.concatenate(frames)
     usual = (~strays(every)).nonzero()[0]
-    order = torch.randperm(len(usual), generator=generator(seed, key, round(time * 1e6)))
+    order = torch.randperm(len(usual), generator=generator(seed, Purpose.MOVING_POINTS, round(time * 1e6)))
     chosen = np.zeros(len(every), bool)
     chosen[usual[order[:count].numpy()]] = True
     found = {}

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from ..runtime.progress import progress
 from ..runtime.search_tree import search_tree
-from ..seeding import generator
+from ..seeding import Purpose, generator
 from .flow_points import InstantPoints
 from .registration import Registration
 
@@ -61,14 +61,12 @@ def gather(
     start: int,
     count: int,
     seed: int,
-    key: int,
     registration: Registration | None = None,
 ) -> tuple[InstantPoints | None, Tracks | None]:
     """Carry the points of all clouds to the pose of cloud ``start``, so that surfaces hidden then are there, too.
 
     Args:
         count: largest number of points.
-        key: of the random choice.
         registration: finds points in images far away in time.
 
     Returns:
@@ -111,7 +109,7 @@ def gather(
     some = (((tracks.places - gathered).norm(dim=2) * sure).amax(0) > STILL * unit).nonzero()[:, 0]
     if not len(some):
         return None, None
-    some = some[torch.randperm(len(some), generator=generator(seed, key, start))[:count]]
+    some = some[torch.randperm(len(some), generator=generator(seed, Purpose.MOVING_POINTS, start))[:count]]
     moves = torch.ones(len(some), dtype=torch.bool)
     everywhere = InstantPoints(gathered[some], torch.cat(colors)[some], moves, first.time)
     return everywhere, tracks.of(some)

@@ -44,13 +44,13 @@ def test_backdrop_lies_on_rays_behind_the_points(seed):
     frames = masked_frames(5)
     normalisation = Normalisation.fit([frame.camera for frame in frames])
     known = normalisation.apply(blobs(0.0).means)
-    found, colors = background_points(43, known, frames, normalisation, seed, 1)
+    found, colors = background_points(43, known, frames, normalisation, seed)
     assert found.shape == colors.shape == (43, 3)
     owned = torch.stack([seen_by(frame, found, colors, known, normalisation) for frame in frames])
     assert owned.any(0).all() and (owned.sum(1) >= 43 // 5).all()
     assert owned[:, :15].any(1).all(), "the first of them come from all frames"
-    again = background_points(43, known, frames, normalisation, seed, 1)
-    other = background_points(43, known, frames, normalisation, 9, 1)
+    again = background_points(43, known, frames, normalisation, seed)
+    other = background_points(43, known, frames, normalisation, 9)
     assert torch.equal(found, again[0]) and not torch.equal(found, other[0])
 
 
@@ -60,8 +60,8 @@ def test_a_frame_without_a_valid_pixel_adds_nothing_to_the_background_points():
     frames[1].mask[:] = False
     normalisation = Normalisation.fit([frame.camera for frame in frames])
     known = normalisation.apply(blobs(0.0).means)
-    assert len(background_points(40, known, frames, normalisation, 0, 1)[0]) == 30
-    assert len(background_points(40, known, frames[1:2], normalisation, 0, 1)[0]) == 0
+    assert len(background_points(40, known, frames, normalisation, 0)[0]) == 30
+    assert len(background_points(40, known, frames[1:2], normalisation, 0)[0]) == 0
 
 
 def test_backdrop_of_images_beyond_2_to_the_24_pixels():
@@ -70,5 +70,5 @@ def test_backdrop_of_images_beyond_2_to_the_24_pixels():
     camera = Camera(tiny_camera(0, 1, 32).viewmat, K, size, size)
     frame = Frame(camera, 0.0, torch.full((1, 1, 3), 0.3).expand(size, size, 3))
     normalisation = Normalisation.fit([camera])
-    found, colors = background_points(50, normalisation.apply(blobs(0.0).means), [frame], normalisation, 0, 1)
+    found, colors = background_points(50, normalisation.apply(blobs(0.0).means), [frame], normalisation, 0)
     assert len(found) == 50 and (colors == 0.3).all()

@@ -50,7 +50,7 @@ def film() -> Dataset:
 def clouds_of(data: Dataset, count: int = 500) -> tuple[list[InstantPoints], Normalisation]:
     normalisation = Normalisation.fit(data.cameras, data.points)
     views = [normalisation.apply_camera(camera) for camera in data.cameras]
-    return depth_clouds(count, data, Flows(data, views), Depths(data, views, normalisation.scale), 0, 1), normalisation
+    return depth_clouds(count, data, Flows(data, views), Depths(data, views, normalisation.scale), 0), normalisation
 
 
 def test_clouds_lie_on_the_ball_at_every_moment(film):
@@ -123,7 +123,7 @@ def test_the_same_points_every_time_and_others_with_another_seed(film):
     assert all(torch.equal(a.points, b.points) for a, b in zip(one, two, strict=True))
     normalisation = Normalisation.fit(film.cameras, film.points)
     views = [normalisation.apply_camera(camera) for camera in film.cameras]
-    other = depth_clouds(100, film, Flows(film, views), Depths(film, views, normalisation.scale), 1, 1)
+    other = depth_clouds(100, film, Flows(film, views), Depths(film, views, normalisation.scale), 1)
     assert not torch.equal(one[0].points, other[0].points)
 
 

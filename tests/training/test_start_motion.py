@@ -51,7 +51,7 @@ def clouds(times=TIMES) -> list[InstantPoints]:
 
 def seen_in(found: list[InstantPoints]) -> SeenMotion:
     start = [cloud.time for cloud in found].index(start_cloud(found).time)
-    source, tracks = gather(found, start, 1_500, 0, 1)
+    source, tracks = gather(found, start, 1_500, 0)
     return SeenMotion(source, found, tracks)
 
 

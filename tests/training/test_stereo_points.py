@@ -33,7 +33,7 @@ def film() -> Dataset:
 def clouds_in(film: Dataset, count: int = 300):
     normalisation, stereo = stereo_of(film)
     views = [normalisation.apply_camera(camera) for camera in film.cameras]
-    return normalisation, stereo_clouds(stereo, Flows(film, views), count, 0, 1)
+    return normalisation, stereo_clouds(stereo, Flows(film, views), count, 0)
 
 
 def found_in(film: Dataset, count: int = 800, time: float = 0.5):

@@ -100,7 +100,7 @@ def test_any_cloud_may_be_the_first(start):
 
 def test_all_sides_are_gathered_in_one_pose():
     """A side that the first cloud does not show comes from the others, where the body is in the first one's pose."""
-    found, tracks = gather(clouds(), MOMENTS // 2, 10_000, 0, 1)
+    found, tracks = gather(clouds(), MOMENTS // 2, 10_000, 0)
     assert tracks is not None and found.time == 0.5
     nearest = torch.cdist(found.points, moved(body(), MOMENTS // 2)).min(1).values
     assert float(nearest.max()) < 0.01
@@ -113,9 +113,9 @@ def test_all_sides_are_gathered_in_one_pose():
         sure = tracks.weights[moment] > 0.1
         there = torch.cdist(tracks.places[moment][sure], moved(body(), moment)).min(1).values
         assert float(there.max()) < 0.02
-    few, some = gather(clouds(), MOMENTS // 2, 100, 0, 1)
+    few, some = gather(clouds(), MOMENTS // 2, 100, 0)
     assert some is not None and len(few.points) == some.places.shape[1] == 100
-    again, _ = gather(clouds(), MOMENTS // 2, 100, 0, 1)
+    again, _ = gather(clouds(), MOMENTS // 2, 100, 0)
     assert torch.equal(few.points, again.points)
 
 
@@ -128,18 +128,18 @@ def test_what_rests_or_strays_is_not_gathered():
         points = torch.cat([cloud.points, wall, moved(far, moment)])
         later = None if cloud.later is None else torch.cat([cloud.later, wall, moved(far, moment + 1)])
         wrong.append(InstantPoints(points, torch.zeros_like(points), points[:, 0] < 9, cloud.time, later))
-    found, _ = gather(wrong, MOMENTS // 2, 10_000, 0, 1)
+    found, _ = gather(wrong, MOMENTS // 2, 10_000, 0)
     assert float(found.points[:, 1].max()) < 1.0 and float(found.points[:, 2].max()) < 1.0 and len(found.points) > 300
 
 
 def test_without_tracks_the_first_cloud_is_all():
-    found, tracks = gather([cloud._replace(later=None) for cloud in clouds()], 3, 10, 0, 1)
+    found, tracks = gather([cloud._replace(later=None) for cloud in clouds()], 3, 10, 0)
     assert tracks is None and torch.equal(found.points, clouds()[3].points)
 
 
 def test_where_tracks_show_that_nothing_moves_there_is_nothing():
     resting = [cloud._replace(points=clouds()[0].points, later=clouds()[0].points) for cloud in clouds()]
-    assert gather(resting, 4, 100, 0, 1) == (None, None)
+    assert gather(resting, 4, 100, 0) == (None, None)
 
 
 def test_places_that_images_show_stop_the_drift():
