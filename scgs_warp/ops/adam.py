@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from functools import lru_cache
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -16,8 +16,7 @@ from ..kernels.cpu import adam as cpu_kernels
 from ..kernels.types import ADAM_CHUNK
 from ..runtime.device_copies import sent
 from ..runtime.launch import launch
-
-Form = Literal["auto", "plain", "cpu"]
+from .forms import Form, chosen_form
 
 
 class Update(NamedTuple):
@@ -54,7 +53,7 @@ def adam_step(
     if not updates:
         return
     device = updates[0].value.device
-    simd = _simd(form, device)
+    form = chosen_form(form, device)
     addresses, factors = [], []
     for update in updates:
         if not _fits(update, device):
@@ -65,7 +64,7 @@ def adam_step(
     sizes, chunks = element_chunks(tuple([update.value.numel() for update in updates]), device)
     tables = table(addresses, np.int64, device), table(factors, np.float32, device), sizes, chunks
     numbers = 1.0 - betas[0], betas[1], 1.0 - betas[1], eps
-    if simd:
+    if form == "cpu":
         launch(cpu_kernels.adam_step, len(chunks), *tables, *numbers, grain=4)
     else:
         launch(kernels.adam_step, len(chunks) * ADAM_CHUNK, *tables, *numbers, None, 0)
@@ -108,14 +107,6 @@ def first_not_finite_by_norm(tensors: Sequence[Tensor]) -> int | None:
     if not filled or math.isfinite(float(torch.nn.utils.get_total_norm([tensor for _, tensor in filled], math.inf))):
         return None
     return next(index for index, tensor in filled if not bool(torch.isfinite(tensor).all()))
-
-
-def _simd(form: str, device: torch.device) -> bool:
-    if form not in ("auto", "plain", "cpu"):
-        raise ValueError(f"form must be auto, plain or cpu, got {form!r}")
-    if form == "cpu" and device.type != "cpu":
-        raise ValueError(f"form cpu needs tensors on the CPU, got {device}")
-    return form == "cpu" or (form == "auto" and device.type == "cpu")
 
 
 def _fits(update: Update, device: torch.device) -> bool:

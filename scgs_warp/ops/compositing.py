@@ -17,7 +17,7 @@ from ..kernels.types import CHANNEL_GROUP, LANES, PACKED_GEOMETRY, SLOT_GEOMETRY
 from ..runtime import debug, memory
 from ..runtime.launch import launch
 from ..types import Splats, Stats, Tiles
-from . import checks, compositing_cuda
+from . import checks, compositing_cuda, forms
 from .binning import bin_window
 from .memory_windows import Demand, Window, slot_bytes
 from .shapes import check_shapes
@@ -104,7 +104,7 @@ def composite(
         background = channels.new_zeros(channels.shape[1])
     else:
         background = background.nan_to_num(0.0, 0.0, 0.0)
-    job = _Job(splats, tiles, stats, absgrad, _resolve_form(form, channels.device, tiles.tile_size), depth_unit)
+    job = _Job(splats, tiles, stats, absgrad, _form(form, channels.device, tiles.tile_size), depth_unit)
     tensors: tuple[Tensor, ...] = (splats.means2d, splats.conics, splats.opacities, channels, background)
     if torch.is_grad_enabled() and any(t.requires_grad for t in tensors):
         if depth_unit is not None:
@@ -162,16 +162,13 @@ class _Composite(torch.autograd.Function):
         return v_means2d, v_conics, v_opacities, v_channels, v_background, None
 
 
-def _resolve_form(form: str, device: torch.device, tile_size: int) -> str:
-    if form not in ("auto", "plain", "cpu", "cuda", "blocks"):
-        raise ValueError(f"form must be auto, plain, cpu, cuda or blocks, got {form!r}")
-    if form == "auto":
-        form = "cuda" if device.type == "cuda" else "cpu"
-        return form if tile_size == TILE_SIZE else "plain"
+def _form(form: Form, device: torch.device, tile_size: int) -> str:
+    """Return the form to run; only ``plain`` takes tiles of other sizes than ``TILE_SIZE``."""
+    if form == "auto" and tile_size != TILE_SIZE:
+        return "plain"
+    form = forms.chosen_form(form, device, Form)
     if form != "plain" and tile_size != TILE_SIZE:
         raise ValueError(f"form {form} needs tiles of {TILE_SIZE} pixels, got tile_size {tile_size}")
-    if form == "cpu" and device.type != "cpu":
-        raise ValueError(f"form cpu needs tensors on the CPU, got {device}")
     return form
 
 

@@ -3,9 +3,6 @@ of the sums of gradients of every form."""
 
 from __future__ import annotations
 
-from typing import Any
-
-import torch
 from torch import Tensor
 
 from ..kernels import compositing
@@ -15,6 +12,7 @@ from ..kernels.cuda import compositing_blocks
 from ..kernels.cuda import slots as slots_cuda
 from ..kernels.types import LANES
 from ..runtime.launch import launch, launch_blocks
+from . import cuda_blocks
 
 
 def forward(
@@ -34,7 +32,7 @@ def forward(
     """
     begin, blocks = window[0], window[1] - window[0]
     if form == "cuda":
-        launch_native(native.composite, blocks, *lists, *size, *outputs, begin=begin)
+        cuda_blocks.launch_native(native.composite, blocks, *lists, *size, *outputs, begin=begin)
     else:
         launch_blocks(
             compositing_blocks.composite,
@@ -63,7 +61,7 @@ def adjoint(
     """
     begin, blocks = window[0], window[1] - window[0]
     if form == "cuda" and lists[3].shape[1] <= native.MAX_CHANNELS:
-        launch_native(native.composite_adjoint, blocks, *lists, *size, v_slots, begin=begin)
+        cuda_blocks.launch_native(native.composite_adjoint, blocks, *lists, *size, v_slots, begin=begin)
     else:
         launch_blocks(
             compositing_blocks.composite_adjoint,
@@ -91,15 +89,3 @@ def sum_slots(
         launch(slots_cuda.sum_slots, slots_cuda.SLOT_WIDTH * count, *slots, *outputs)
     else:
         launch(compositing.sum_slots, count, *slots, *outputs)
-
-
-def launch_native(kernel: Any, blocks: int, *args: Any, begin: int = 0) -> None:
-    """Launch a kernel that exists on CUDA alone.
-
-    Raises:
-        RuntimeError: the tensors are on a CPU, where the kernel's body is empty.
-    """
-    device: torch.device = args[0].device
-    if device.type != "cuda":
-        raise RuntimeError(f"form cuda needs a GPU, got tensors on {device}")
-    launch_blocks(kernel, blocks, *args, block_dim=native.BLOCK_DIM, begin=begin)

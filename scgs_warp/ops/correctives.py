@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -11,9 +11,8 @@ from ..kernels import correctives as kernels
 from ..kernels.cpu import correctives as cpu_kernels
 from ..kernels.types import LANES
 from ..runtime.launch import launch
+from .forms import Form, chosen_form
 from .shapes import check_shapes
-
-Form = Literal["auto", "plain", "cpu"]
 
 COLUMNS = 27
 """Number of corrective parameters per Gaussian: a 3 x 9 matrix."""
@@ -74,7 +73,7 @@ def correct(
         turn surfaces to move them. A non-finite displacement is left out.
 
     Raises:
-        ValueError: a shape is wrong.
+        ValueError: a shape or the form is wrong.
     """
     count = means.shape[0]
     expected = {
@@ -85,7 +84,6 @@ def correct(
         "quats_own": (quats_own, (count, 4)),
     }
     check_shapes(expected)
-    if form == "auto":
-        form = "cpu" if means.device.type == "cpu" else "plain"
+    form = chosen_form(form, means.device)
     turns = (None if value is None else value.detach().contiguous() for value in (quats, quats_t, quats_own))
     return _Correct.apply(means.contiguous(), correctives.contiguous(), *turns, form)  # type: ignore[return-value]

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -14,11 +14,11 @@ from ..runtime.launch import launch
 from .activations import exponential, sigmoid
 from .correctives import COLUMNS as CORRECTIVE_COLUMNS
 from .correctives import correct
+from .forms import Form, chosen_form
 from .shading import COLUMNS as SHADING_COLUMNS
 from .shading import shade, tint
 from .shapes import check_shapes
 
-Form = Literal["auto", "plain", "cpu"]
 Finished = tuple[Tensor, Tensor, Tensor, Tensor]
 
 
@@ -53,9 +53,7 @@ def finish(
         ValueError: a shape or the form is wrong, or there are both log scales and tints.
     """
     _check(means, quats_t, rest, log_scales, tints, own)
-    if form not in ("auto", "plain", "cpu") or (form == "cpu" and means.device.type != "cpu"):
-        raise ValueError(f"form must be auto, plain or, on a CPU, cpu, got {form!r} on {means.device}")
-    if form == "plain" or (form == "auto" and means.device.type != "cpu"):
+    if chosen_form(form, means.device) == "plain":
         return _in_parts(means, quats_t, rest, log_scales, tints, own)
     _, quats, rest_scales, logits, sh_dc, correctives, shading = rest
     extras, kind = (log_scales, LOG_SCALES) if tints is None else (tints, TINTS)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal, get_args
+from typing import Any
 
 import torch
 import warp as wp
@@ -13,16 +13,16 @@ from ..kernels.cpu import harmonics as cpu_kernels
 from ..kernels.cuda import harmonics as cuda_kernels
 from ..kernels.types import LANES
 from ..runtime.launch import launch
-from . import compositing_cuda
+from . import cuda_blocks, forms
+from .forms import GpuForm
 from .reduction import sum_rows
 
 MAX_DEGREE = 3
-Form = Literal["auto", "plain", "cpu", "cuda"]
 
 
 class _SphericalHarmonics(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, sh_dc: Tensor, sh_rest: Tensor, means: Tensor, camera: Tensor, degree: int, form: Form):
+    def forward(ctx: Any, sh_dc: Tensor, sh_rest: Tensor, means: Tensor, camera: Tensor, degree: int, form: GpuForm):
         count, rest = sh_rest.shape[:2]
         colors = torch.empty_like(sh_dc)
         flat = sh_rest.view(count * rest, 3)
@@ -66,7 +66,7 @@ class _WholeHarmonics(torch.autograd.Function):
     """As :class:`_SphericalHarmonics`, with all coefficients in one tensor, [N, K, 3], which is not cut or copied."""
 
     @staticmethod
-    def forward(ctx: Any, sh: Tensor, means: Tensor, camera: Tensor, degree: int, form: Form):
+    def forward(ctx: Any, sh: Tensor, means: Tensor, camera: Tensor, degree: int, form: GpuForm):
         count, row = sh.shape[:2]
         colors, flat = torch.empty_like(means), sh.view(count * row, 3)
         rows = flat, row, 1, means, camera[None], degree, colors
@@ -98,15 +98,7 @@ class _WholeHarmonics(torch.autograd.Function):
 
 def _launch_blocks(kernel: wp.Kernel, count: int, *args: Any) -> None:
     """Launch a kernel of the form ``cuda`` for ``count`` Gaussians."""
-    compositing_cuda.launch_native(kernel, -(-count // cuda_kernels.GAUSSIANS), *args)
-
-
-def _resolve_form(form: Form, device: torch.device) -> Form:
-    if form not in get_args(Form):
-        raise ValueError(f"form must be auto, plain, cpu or cuda, got {form!r}")
-    if form != "auto":
-        return form
-    return "cpu" if device.type == "cpu" else "cuda" if device.type == "cuda" else "plain"
+    cuda_blocks.launch_native(kernel, -(-count // cuda_kernels.GAUSSIANS), *args)
 
 
 def _camera_gradient(v_means: Tensor | None, wanted: bool) -> Tensor | None:
@@ -126,12 +118,12 @@ def whole_harmonics(sh: Tensor, means: Tensor, camera_position: Tensor, degree: 
         return spherical_harmonics(sh[:, 0], sh[:, 1:], means, camera_position, degree)
     _validate(sh[:, 0], sh[:, 1:], means, degree)
     _validate_camera(camera_position)
-    form = _resolve_form("auto", sh.device)
+    form = forms.chosen_form("auto", sh.device, GpuForm)
     return _WholeHarmonics.apply(sh, means.contiguous(), camera_position.contiguous(), degree, form)  # type: ignore
 
 
 def spherical_harmonics(
-    sh_dc: Tensor, sh_rest: Tensor, means: Tensor, camera_position: Tensor, degree: int, *, form: Form = "auto"
+    sh_dc: Tensor, sh_rest: Tensor, means: Tensor, camera_position: Tensor, degree: int, *, form: GpuForm = "auto"
 ) -> Tensor:
     """Return the colours of Gaussians seen from one point: harmonics + 0.5, clamped at 0 (basis signs as in 3D-GS).
 
@@ -156,12 +148,20 @@ def spherical_harmonics(
     _validate(sh_dc, sh_rest, means, degree)
     _validate_camera(camera_position)
     tensors = (x.contiguous() for x in (sh_dc, sh_rest, means, camera_position))
-    return _SphericalHarmonics.apply(*tensors, degree, _resolve_form(form, sh_dc.device))  # type: ignore[return-value]
+    form = forms.chosen_form(form, sh_dc.device, GpuForm)
+    return _SphericalHarmonics.apply(*tensors, degree, form)  # type: ignore[return-value]
 
 
 @torch.no_grad()
 def colors_and_depths(
-    sh_dc: Tensor, sh_rest: Tensor, means: Tensor, viewmat: Tensor, depths: Tensor, degree: int, *, form: Form = "auto"
+    sh_dc: Tensor,
+    sh_rest: Tensor,
+    means: Tensor,
+    viewmat: Tensor,
+    depths: Tensor,
+    degree: int,
+    *,
+    form: GpuForm = "auto",
 ) -> Tensor:
     """Return the colours of :func:`spherical_harmonics` and the depths side by side, [N, 4], without gradients.
 
@@ -179,7 +179,7 @@ def colors_and_depths(
         raise ValueError(f"viewmat must be [4, 4] and depths [{count}], got {[*viewmat.shape]} and {[*depths.shape]}")
     channels = sh_dc.new_empty(count, 4)
     tensors = sh_dc.contiguous(), sh_rest.contiguous().view(count * rest, 3), rest, means.contiguous()
-    form = _resolve_form(form, sh_dc.device)
+    form = forms.chosen_form(form, sh_dc.device, GpuForm)
     if form == "cpu":
         position = -viewmat[:3, :3].T @ viewmat[:3, 3]
         rows = position[None], depths.contiguous(), degree, channels

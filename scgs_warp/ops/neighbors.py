@@ -11,7 +11,7 @@ from ..kernels import neighbors as kernels
 from ..kernels.cpu import neighbor_lists, neighbors
 from ..kernels.cuda import neighbors as cuda_kernels
 from ..runtime.launch import launch
-from . import compositing_cuda, radix
+from . import cuda_blocks, radix
 from .node_sums import rbf_node_sums
 
 SAMPLE = 4096
@@ -88,7 +88,7 @@ def nearest(points: Tensor, nodes: Tensor, k: int) -> tuple[Tensor, Tensor]:
         launch(neighbors.nearest, _blocks(points), *arguments, grain=16)
     elif points.is_cuda and k <= cuda_kernels.MAX_NEIGHBORS and points.shape[1] <= cuda_kernels.MAX_DIMENSIONS:
         blocks = -(-points.shape[0] // cuda_kernels.BLOCK_DIM)
-        compositing_cuda.launch_native(cuda_kernels.nearest, blocks, *arguments)
+        cuda_blocks.launch_native(cuda_kernels.nearest, blocks, *arguments)
     else:
         launch(kernels.nearest, points.shape[0], *arguments)
     return indices, distances

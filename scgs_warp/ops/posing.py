@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -14,10 +14,8 @@ from ..kernels.types import LANES
 from ..runtime.launch import launch
 from ..types import Pose
 from .finishing import check_rest
+from .forms import Form, chosen_form
 from .skinning import check_inputs, pack_palette, pose_tensors
-
-Form = Literal["auto", "plain", "cpu"]
-
 
 WIDTHS = {"translations": 3, "rotations": 4, "shape_rotations": 4, "log_scales": 3, "tints": 3}
 """Number of columns of each field of a pose."""
@@ -100,7 +98,7 @@ def pose_gaussians(
         give them (form ``cpu`` to the bit); no gradients.
 
     Raises:
-        ValueError: a shape is wrong, or there are more neighbours than the form takes.
+        ValueError: a shape or the form is wrong, or there are more neighbours than the form takes.
     """
     check_inputs(rest[0], rest[1], nodes, pose, indices, weights)
     check_rest(rest, own)
@@ -113,8 +111,9 @@ def pose_gaussians(
     binding = indices.contiguous(), weights.contiguous(), own, int(own is not None)
     means, quats, scales, opacities, sh_dc = (torch.empty_like(value) for value in rest[:5])
     posed = means, quats, scales, opacities, sh_dc
-    if form == "auto":
-        form = "cpu" if nodes.device.type == "cpu" and indices.shape[1] <= MAX_NEIGHBORS else "plain"
+    if form == "auto" and indices.shape[1] > MAX_NEIGHBORS:
+        form = "plain"
+    form = chosen_form(form, nodes.device)
     if form == "cpu":
         palette = pack_palette(nodes, (translations, rotations, shapes, extras))
         launch(cpu_kernels.pose_gaussians, -(-count // LANES), *rest, *palette, kind, *binding, *posed, grain=32)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -11,10 +11,10 @@ from ..kernels import projection as kernels
 from ..kernels.cpu import projection as cpu_kernels
 from ..runtime.launch import launch
 from ..types import Splats
+from .forms import Form, chosen_form
 from .reduction import sum_rows
 from .shapes import check_shapes
 
-Form = Literal["auto", "plain", "cpu"]
 MAX_SHARPNESS = 100.0
 """Bound that keeps the powers of the squared distance finite."""
 
@@ -142,7 +142,7 @@ def project(
         the clamp of the Jacobian to the frustum widened by 0.3 tan(fov / 2), or to a Gaussian whose gradient overflows.
 
     Raises:
-        ValueError: a shape or a size is wrong.
+        ValueError: a shape, a size or the form is wrong.
     """
     _validate(means, quats, scales, opacities, viewmat, K)
     if width <= 0 or height <= 0:
@@ -160,7 +160,6 @@ def project(
         float(sharpness),
     )
     tensors = (x.contiguous() for x in (means, quats, scales, opacities, viewmat, K))
-    if form == "auto":
-        form = "cpu" if means.device.type == "cpu" else "plain"
-    means2d, conics, depths, seen, radii = _Project.apply(*tensors, settings, form)
+    found = _Project.apply(*tensors, settings, chosen_form(form, means.device))
+    means2d, conics, depths, seen, radii = found
     return Splats(means2d, conics, depths, seen, radii, settings.width, settings.height, settings.sharpness)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Any
 
 import torch
 import warp as wp
@@ -12,9 +12,8 @@ from ..kernels import shading as kernels
 from ..kernels.cpu import shading as cpu_kernels
 from ..kernels.types import LANES
 from ..runtime.launch import launch
+from .forms import Form, chosen_form
 from .shapes import check_shapes
-
-Form = Literal["auto", "plain", "cpu"]
 
 COLUMNS = 10
 """Number of shading parameters per Gaussian: a 3 x 3 matrix and a coefficient."""
@@ -27,10 +26,6 @@ def _run(plain: wp.Kernel, cpu: wp.Kernel, form: Form, *args: Tensor) -> None:
         launch(cpu, -(-count // LANES), *args, grain=32)
     else:
         launch(plain, count, *args)
-
-
-def _chosen(form: Form, value: Tensor) -> Form:
-    return form if form != "auto" else "cpu" if value.device.type == "cpu" else "plain"
 
 
 class _Shade(torch.autograd.Function):
@@ -72,7 +67,7 @@ def shade(sh_dc: Tensor, shading: Tensor, quats: Tensor, quats_t: Tensor, *, for
         surfaces to match a brightness.
 
     Raises:
-        ValueError: a shape is wrong.
+        ValueError: a shape or the form is wrong.
     """
     count = sh_dc.shape[0]
     expected = {
@@ -83,7 +78,7 @@ def shade(sh_dc: Tensor, shading: Tensor, quats: Tensor, quats_t: Tensor, *, for
     }
     check_shapes(expected)
     quats, quats_t = quats.detach().contiguous(), quats_t.detach().contiguous()
-    return _Shade.apply(sh_dc.contiguous(), shading.contiguous(), quats, quats_t, _chosen(form, sh_dc))  # type: ignore
+    return _Shade.apply(sh_dc.contiguous(), shading.contiguous(), quats, quats_t, chosen_form(form, sh_dc.device))  # type: ignore
 
 
 class _Tint(torch.autograd.Function):
@@ -117,8 +112,8 @@ def tint(sh_dc: Tensor, tints: Tensor, *, form: Form = "auto") -> Tensor:
         [N, 3] coefficients of degree 0. Gradients reach both; a tint at or beyond a limit gets none.
 
     Raises:
-        ValueError: a shape is wrong.
+        ValueError: a shape or the form is wrong.
     """
     count = sh_dc.shape[0]
     check_shapes({"sh_dc": (sh_dc, (count, 3)), "tints": (tints, (count, 3))})
-    return _Tint.apply(sh_dc.contiguous(), tints.contiguous(), _chosen(form, sh_dc))  # type: ignore[return-value]
+    return _Tint.apply(sh_dc.contiguous(), tints.contiguous(), chosen_form(form, sh_dc.device))  # type: ignore[return-value]

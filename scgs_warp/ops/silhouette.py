@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -12,9 +12,8 @@ from ..kernels.cpu import silhouette as cpu_kernels
 from ..kernels.types import LANES
 from ..runtime.launch import launch
 from ..types import Camera
+from .forms import Form, chosen_form
 from .reduction import sum_rows
-
-Form = Literal["auto", "plain", "cpu"]
 
 BLOCKS = 128
 """Smallest number of blocks of 16 spheres that a thread takes."""
@@ -94,10 +93,7 @@ def silhouette(
         found = tuple(value.shape)
         if len(found) != len(shape) or any(n != m if isinstance(m, int) else n == 0 for n, m in zip(found, shape)):
             raise ValueError(f"{name} must be [{', '.join(map(str, shape))}], not empty, got {found}")
-    if form not in ("auto", "plain", "cpu") or (form == "cpu" and means.device.type != "cpu"):
-        raise ValueError(f"form must be auto, plain or, on a CPU, cpu, got {form!r} on {means.device}")
-    if form == "auto":
-        form = "cpu" if means.device.type == "cpu" else "plain"
+    form = chosen_form(form, means.device)
     seen = camera.viewmat.detach().contiguous()[None], camera.K.detach().contiguous()[None], camera.width
     compared = (tensor.detach().contiguous() for tensor in (distances, size, pixels))
     return _Compare.apply(means.contiguous(), *seen, *compared, form)  # type: ignore[return-value]

@@ -4,7 +4,7 @@ adjoint."""
 from __future__ import annotations
 
 import math
-from typing import Any, Literal
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -14,13 +14,13 @@ from ..kernels import ssim as kernels
 from ..kernels.cpu import ssim as cpu_kernels
 from ..kernels.ssim import LEAST_ERROR
 from ..kernels.types import SSIM_BAND
-from ..runtime import launch
+from ..runtime.launch import launch
+from . import forms
+from .forms import GpuForm
 from .ssim_cuda import PhotometricTiles
 
-Form = Literal["auto", "plain", "cpu", "cuda"]
 
-
-def ssim(image: Tensor, truth: Tensor, mask: Tensor | None = None, *, form: Form = "auto") -> Tensor:
+def ssim(image: Tensor, truth: Tensor, mask: Tensor | None = None, *, form: GpuForm = "auto") -> Tensor:
     """Return the structural similarity (Wang et al. 2004): 11 x 11 Gaussian, sigma 1.5, zero padding, data range 1.
 
     Args:
@@ -47,7 +47,7 @@ def photometric_loss(
     ssim_weight: float = 0.2,
     log_weight: float = 0.0,
     *,
-    form: Form = "auto",
+    form: GpuForm = "auto",
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return ``(1 - w) L1 + w (1 - SSIM)`` (Kerbl et al. 2023, equation 7), plus ``v log(MSE)`` where asked.
 
@@ -78,7 +78,7 @@ def photometric_loss(
             f"mask must be {list(image.shape[1:])} bool on {image.device}, "
             f"got {list(mask.shape)} {mask.dtype} on {mask.device}"
         )
-    resolved = _resolve_form(form, image.device)
+    resolved = forms.chosen_form(form, image.device, GpuForm)
     needs_gradient = torch.is_grad_enabled() and image.requires_grad
     arguments = image, truth.detach(), mask, (ssim_weight, log_weight)
     if resolved == "cuda":
@@ -86,22 +86,11 @@ def photometric_loss(
     return _Photometric.apply(*arguments, resolved == "cpu", needs_gradient)
 
 
-def _resolve_form(form: str, device: torch.device) -> str:
-    """Return the form to run on a device."""
-    if form not in ("auto", "plain", "cpu", "cuda"):
-        raise ValueError(f"form must be auto, plain, cpu or cuda, got {form!r}")
-    if form == "auto":
-        return "cuda" if device.type == "cuda" else "cpu"
-    if form == "cpu" and device.type != "cpu":
-        raise ValueError(f"form 'cpu' needs tensors on the CPU, image is on {device}")
-    return form
-
-
 def _forward_bands(image: Tensor, truth: Tensor, mask: Tensor | None, partials: Tensor | None) -> Tensor:
     channels, height, _ = image.shape
     sums = image.new_empty(3, channels, height)
     bands = channels * -(-height // SSIM_BAND)
-    launch.launch(cpu_kernels.photometric, bands, image, truth, mask, sums, partials, grain=1)
+    launch(cpu_kernels.photometric, bands, image, truth, mask, sums, partials, grain=1)
     return sums
 
 
@@ -112,11 +101,9 @@ def _forward_pixels(image: Tensor, truth: Tensor, mask: Tensor | None, partials:
     partials = image.new_empty(3, *image.shape) if partials is None else partials
     sums = image.new_empty(3, channels, height)
     count, masked = image.numel(), int(mask is not None)
-    launch.launch(kernels.blur_rows, count, image, truth, mask, masked, blurred)
-    launch.launch(kernels.photometric, count, image, truth, mask, masked, blurred, values, partials)
-    launch.launch(
-        kernels.sum_rows, 3 * channels * height, values.view(3 * channels * height, width), sums.view(-1), grain=16
-    )
+    launch(kernels.blur_rows, count, image, truth, mask, masked, blurred)
+    launch(kernels.photometric, count, image, truth, mask, masked, blurred, values, partials)
+    launch(kernels.sum_rows, 3 * channels * height, values.view(3 * channels * height, width), sums.view(-1), grain=16)
     return sums
 
 
@@ -124,9 +111,9 @@ def _adjoint_pixels(
     image: Tensor, truth: Tensor, mask: Tensor | None, partials: Tensor, v_sums: Tensor, v_image: Tensor
 ) -> None:
     blurred, count = torch.empty_like(partials), image.numel()
-    launch.launch(kernels.blur_rows_adjoint, count, partials, blurred)
+    launch(kernels.blur_rows_adjoint, count, partials, blurred)
     masked = int(mask is not None)
-    launch.launch(kernels.photometric_adjoint, count, image, truth, mask, masked, blurred, v_sums, v_image)
+    launch(kernels.photometric_adjoint, count, image, truth, mask, masked, blurred, v_sums, v_image)
 
 
 Scores = tuple[tuple[Tensor, Tensor, Tensor], Any, Any]
@@ -223,9 +210,7 @@ class _Photometric(torch.autograd.Function):
             v_sums = slopes(image, gradients, ctx.count, ctx.error, *ctx.weights)
             if ctx.simd:
                 bands = image.shape[0] * -(-image.shape[1] // SSIM_BAND)
-                launch.launch(
-                    cpu_kernels.photometric_adjoint, bands, image, truth, mask, partials, v_sums, v_image, grain=1
-                )
+                launch(cpu_kernels.photometric_adjoint, bands, image, truth, mask, partials, v_sums, v_image, grain=1)
             else:
                 _adjoint_pixels(image, truth, mask, partials, v_sums, v_image)
         return v_image, None, None, None, None, None

@@ -10,7 +10,7 @@ from torch.autograd.function import once_differentiable
 
 from ..kernels.cuda import ssim as kernels
 from ..kernels.types import SSIM_TILE_COLUMNS, SSIM_TILE_ROWS
-from . import compositing_cuda
+from . import cuda_blocks
 
 
 def tile_count(image: Tensor) -> int:
@@ -39,8 +39,8 @@ class PhotometricTiles(torch.autograd.Function):
         partials = image.new_empty(3, *image.shape) if needs_gradient else None
         count = tile_count(image)
         sums, results, slopes = image.new_empty(count, 4), image.new_empty(3), image.new_empty(2)
-        compositing_cuda.launch_native(kernels.photometric, count, image, truth, mask, sums, partials)
-        compositing_cuda.launch_native(kernels.photometric_total, 1, sums, *weights, results, slopes)
+        cuda_blocks.launch_native(kernels.photometric, count, image, truth, mask, sums, partials)
+        cuda_blocks.launch_native(kernels.photometric_total, 1, sums, *weights, results, slopes)
         ctx.save_for_backward(image, truth, mask, partials, slopes)
         ctx.ssim_weight = weights[0]
         ctx.set_materialize_grads(False)
@@ -52,7 +52,7 @@ class PhotometricTiles(torch.autograd.Function):
         image, truth, mask, partials, slopes = ctx.saved_tensors
         v_image = torch.empty_like(image)
         v_results = (None if v is None else v.reshape(1) for v in gradients)
-        compositing_cuda.launch_native(
+        cuda_blocks.launch_native(
             kernels.photometric_adjoint,
             tile_count(image),
             *(image, truth, mask, partials, slopes, *v_results),

@@ -15,7 +15,7 @@ from fuzz.cases_training import case_loss
 from fuzz.poison import Draw
 from helpers.cuda_emulation import COMPILER, build, launcher
 from scgs_warp.kernels import compositing
-from scgs_warp.ops import compositing_cuda
+from scgs_warp.ops import compositing_cuda, cuda_blocks
 from scgs_warp.runtime.kernel_arguments import parameters_of
 from scgs_warp.runtime.launch import launch
 
@@ -30,7 +30,7 @@ def library() -> ctypes.CDLL:
 
 @contextmanager
 def emulated(seed: int) -> Iterator[None]:
-    native, blocks_of = compositing_cuda.launch_native, compositing_cuda.launch_blocks
+    native, blocks_of = cuda_blocks.launch_native, compositing_cuda.launch_blocks
     run = launcher(library(), seed)
 
     def fenced_native(kernel: Any, blocks: int, *args: Any, begin: int = 0) -> None:
@@ -42,11 +42,11 @@ def emulated(seed: int) -> Iterator[None]:
     def portable(kernel: Any, blocks: int, *args: Any, block_dim: int, begin: int = 0) -> None:
         launch(compositing.composite_adjoint, blocks, *args, begin=begin)
 
-    compositing_cuda.launch_native, compositing_cuda.launch_blocks = fenced_native, portable  # type: ignore[assignment]
+    cuda_blocks.launch_native, compositing_cuda.launch_blocks = fenced_native, portable  # type: ignore[assignment]
     try:
         yield
     finally:
-        compositing_cuda.launch_native, compositing_cuda.launch_blocks = native, blocks_of
+        cuda_blocks.launch_native, compositing_cuda.launch_blocks = native, blocks_of
 
 
 def case_native_compositing(d: Draw, device: str) -> None:

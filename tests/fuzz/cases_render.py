@@ -13,7 +13,8 @@ from helpers.splats import random_splats
 from scgs_warp.ops.binning import BandBinning, bin_splats
 from scgs_warp.ops.binning_cuda import RadixBinning, bin_within, geometry_of
 from scgs_warp.ops.compositing import composite
-from scgs_warp.ops.harmonics import Form, spherical_harmonics
+from scgs_warp.ops.forms import GpuForm
+from scgs_warp.ops.harmonics import spherical_harmonics
 from scgs_warp.ops.projection import project
 from scgs_warp.rendering.render import draw as draw_image
 from scgs_warp.rendering.render import render
@@ -104,7 +105,7 @@ def case_projection(d: Draw, device: str) -> None:
         laws.equal(f"{name} of the valid", getattr(splats, name)[whole], getattr(alone, name))
 
 
-def case_harmonics(d: Draw, device: str, form: Form | None = None) -> None:
+def case_harmonics(d: Draw, device: str, form: GpuForm | None = None) -> None:
     """No colour is negative; an invalid row affects itself alone and passes no gradient."""
     count, degree = d.count(), int(d.rng.integers(4))
     g, camera = poisoned_gaussians(d, count, max(degree, int(d.rng.integers(4)))), d.normal(3)

@@ -24,10 +24,11 @@ from scgs_warp.motion import Motion, build_motion
 from scgs_warp.ops.adam import Update, adam_step, first_not_finite
 from scgs_warp.ops.correctives import correct
 from scgs_warp.ops.finishing import finish
+from scgs_warp.ops.forms import GpuForm
 from scgs_warp.ops.harmonics_rotation import SIZES, rotate_harmonics
 from scgs_warp.ops.reduction import sum_rows
 from scgs_warp.ops.shading import shade, tint
-from scgs_warp.ops.ssim import Form, photometric_loss
+from scgs_warp.ops.ssim import photometric_loss
 from scgs_warp.optim import Adam
 from scgs_warp.runtime.launch import launch
 from scgs_warp.scene.arguments import ROUNDING
@@ -42,7 +43,7 @@ LARGEST_PIXEL = 1e9
 """Largest pixel whose fourth power fits into a float32; beyond it the loss is not finite."""
 
 
-def case_loss(d: Draw, device: str, form: Form | None = None) -> None:
+def case_loss(d: Draw, device: str, form: GpuForm | None = None) -> None:
     """Losses are finite for pixels up to 1e9, ignore masked pixels, and never hide a NaN."""
     (width, height), channels = d.size(), int(d.pick((1, 3, 4)))
     image, truth = d.uniform(channels, height, width), d.uniform(channels, height, width)

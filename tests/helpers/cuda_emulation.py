@@ -97,7 +97,7 @@ def build(folder: Path) -> ctypes.CDLL:
 
 
 def launcher(library: ctypes.CDLL, seed: int = 0) -> Callable[..., None]:
-    """Return a function that takes the place of ``ops.compositing_cuda.launch_native``."""
+    """Return a function that takes the place of ``ops.cuda_blocks.launch_native``."""
 
     def launch_native(kernel: wp.Kernel, blocks: int, *args: Any, begin: int = 0) -> None:
         declared = [argument.type for argument in kernel.adj.args[1:]]

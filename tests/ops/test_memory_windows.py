@@ -11,7 +11,7 @@ from helpers.cuda_emulation import COMPILER, build, launcher
 from helpers.splats import random_splats
 from helpers.tiny import tiny_config, tiny_dataset
 from scgs_warp.errors import UserError
-from scgs_warp.ops import binning_cuda, compositing_cuda, memory_windows
+from scgs_warp.ops import binning_cuda, cuda_blocks, memory_windows
 from scgs_warp.ops.binning import BandBinning, bin_splats, bin_window
 from scgs_warp.ops.compositing import composite, demand
 from scgs_warp.ops.memory_windows import Demand
@@ -147,7 +147,7 @@ def test_same_bits_in_windows_of_any_size(device: str, form: str, channels: int,
 
 @pytest.mark.skipif(COMPILER is None, reason="no C++ compiler, or not Linux, whose fibres the shim uses")
 def test_same_bits_in_windows_by_the_native_form(tmp_path, monkeypatch: pytest.MonkeyPatch):
-    monkeypatch.setattr(compositing_cuda, "launch_native", launcher(build(tmp_path)))
+    monkeypatch.setattr(cuda_blocks, "launch_native", launcher(build(tmp_path)))
     splats = some_splats(2)
     whole = draw(splats, "cuda")
     cuts = squeeze(monkeypatch, 22_000)

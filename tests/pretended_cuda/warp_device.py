@@ -41,7 +41,7 @@ def install(native: Path) -> None:
     Args:
         native: folder for the compiled native bodies.
     """
-    from scgs_warp.ops import compositing, compositing_cuda, harmonics, radix, ssim
+    from scgs_warp.ops import cuda_blocks, forms, radix
     from scgs_warp.runtime import cuda_launch
 
     to_warp = wp.device_from_torch
@@ -80,17 +80,16 @@ def install(native: Path) -> None:
             sort(keys, values, count, bits)
 
     radix.radix_sort = sorted_on_device
-    for op in (compositing, harmonics, ssim):
-        op._resolve_form = _portable_on_demand(op._resolve_form)
-    compositing_cuda.launch_native = _native(compositing_cuda.launch_native, native)
+    forms.chosen_form = _portable_on_demand(forms.chosen_form)
+    cuda_blocks.launch_native = _native(cuda_blocks.launch_native, native)
 
 
-def _portable_on_demand(resolve: Callable[..., str]) -> Callable[..., str]:
-    def resolve_form(form: str, *args: Any) -> str:
-        found = resolve(form, *args)
+def _portable_on_demand(choose: Callable[..., str]) -> Callable[..., str]:
+    def chosen_form(form: str, *args: Any) -> str:
+        found = choose(form, *args)
         return "plain" if found == "cuda" and form == "auto" and not native_bodies else found
 
-    return resolve_form
+    return chosen_form
 
 
 def _native(launch: Callable[..., None], folder: Path) -> Callable[..., None]:

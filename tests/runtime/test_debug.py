@@ -12,7 +12,7 @@ import torch
 from helpers.cuda_emulation import COMPILER, build, launcher
 from helpers.splats import random_splats
 from scgs_warp.benchmark import scenes
-from scgs_warp.ops import binning, binning_cuda, checks, compositing, compositing_cuda
+from scgs_warp.ops import binning, binning_cuda, checks, compositing, compositing_cuda, cuda_blocks
 from scgs_warp.ops.binning import bin_splats
 from scgs_warp.ops.binning_cuda import bin_within
 from scgs_warp.ops.compositing import composite
@@ -72,7 +72,7 @@ def test_random_scenes_keep_every_promise(device: str, form: str, how: dict, deb
 
 @pytest.mark.skipif(COMPILER is None, reason="no C++ compiler, or not Linux, whose fibres the shim uses")
 def test_so_do_the_native_form_and_the_radix_sort(tmp_path, monkeypatch: pytest.MonkeyPatch, debugging: None):
-    monkeypatch.setattr(compositing_cuda, "launch_native", launcher(build(tmp_path)))
+    monkeypatch.setattr(cuda_blocks, "launch_native", launcher(build(tmp_path)))
     monkeypatch.setattr(binning, "BandBinning", binning_cuda.RadixBinning)
     for seed in range(2):
         draw(some_splats(seed), "cuda")

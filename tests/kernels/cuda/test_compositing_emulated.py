@@ -12,7 +12,7 @@ from helpers.compositing_forms import CASES, largest_differences, run_form
 from helpers.cuda_emulation import COMPILER, build, launcher
 from scgs_warp.kernels import compositing
 from scgs_warp.kernels.cuda.slots import SLOT_WIDTH
-from scgs_warp.ops import compositing_cuda
+from scgs_warp.ops import compositing_cuda, cuda_blocks
 from scgs_warp.runtime.launch import launch
 
 pytestmark = pytest.mark.skipif(COMPILER is None, reason="no C++ compiler, or not Linux, whose fibres the shim uses")
@@ -31,7 +31,7 @@ def emulate(monkeypatch: pytest.MonkeyPatch, library: ctypes.CDLL, seed: int = 0
         assert kernel.key == "composite_adjoint"
         launch(compositing.composite_adjoint, blocks, *args, begin=begin)
 
-    monkeypatch.setattr(compositing_cuda, "launch_native", launcher(library, seed))
+    monkeypatch.setattr(cuda_blocks, "launch_native", launcher(library, seed))
     monkeypatch.setattr(compositing_cuda, "launch_blocks", portable)
 
 

@@ -12,7 +12,7 @@ from helpers.cuda_emulation import COMPILER, build, launcher
 from helpers.scenes import random_camera
 from reference.harmonics import spherical_harmonics as harmonics_reference
 from scgs_warp.kernels.cuda.harmonics import GAUSSIANS
-from scgs_warp.ops import compositing_cuda, harmonics
+from scgs_warp.ops import cuda_blocks, harmonics
 
 emulated = pytest.mark.skipif(COMPILER is None, reason="no C++ compiler, or not Linux, whose fibres the shim uses")
 CAMERA = torch.tensor([0.5, -3.0, 2.0])
@@ -27,7 +27,7 @@ def library(tmp_path_factory: pytest.TempPathFactory) -> ctypes.CDLL:
 
 @pytest.fixture
 def native(library: ctypes.CDLL, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(compositing_cuda, "launch_native", launcher(library))
+    monkeypatch.setattr(cuda_blocks, "launch_native", launcher(library))
 
 
 def inputs_of(count: int, rest: int) -> list[Tensor]:
@@ -182,7 +182,7 @@ def test_bits_do_not_depend_on_who_runs_first(layout: str, library: ctypes.CDLL,
     inputs, weights = inputs_of(300, 15), weights_of(300)
     runs = []
     for seed in (1, 2, 3):
-        monkeypatch.setattr(compositing_cuda, "launch_native", launcher(library, seed))
+        monkeypatch.setattr(cuda_blocks, "launch_native", launcher(library, seed))
         runs.append([run("cuda", layout, inputs, degree, weights) for degree in (2, 3)])
     for other in runs[1:]:
         assert all(torch.equal(a, b) for own, first in zip(other, runs[0]) for a, b in zip(own, first))

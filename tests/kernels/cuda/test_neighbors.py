@@ -10,7 +10,7 @@ import torch
 from helpers.cuda_emulation import COMPILER, build, launcher
 from scgs_warp.kernels import neighbors as kernels
 from scgs_warp.kernels.cuda import neighbors as cuda_kernels
-from scgs_warp.ops import compositing_cuda
+from scgs_warp.ops import cuda_blocks
 from scgs_warp.ops.neighbors import nearest, node_lists
 from scgs_warp.runtime.launch import launch
 
@@ -78,13 +78,13 @@ def test_poison(value: float, library: ctypes.CDLL):
 @pytest.mark.parametrize(("k", "dimensions", "native"), [(4, 12, True), (1, 3, True), (5, 3, False), (4, 13, False)])
 def test_which_form_a_gpu_runs(device: str, k: int, dimensions: int, native: bool, monkeypatch):
     points, nodes = grid(6, 30, dimensions).to(device), grid(7, 20, dimensions).to(device)
-    names, inner = [], compositing_cuda.launch_native
+    names, inner = [], cuda_blocks.launch_native
 
     def noting(kernel, blocks, *args, begin=0):
         names.append(kernel.key)
         inner(kernel, blocks, *args, begin=begin)
 
-    monkeypatch.setattr(compositing_cuda, "launch_native", noting)
+    monkeypatch.setattr(cuda_blocks, "launch_native", noting)
     indices, distances = nearest(points, nodes, k)
     assert names == (["nearest"] if native and device == "cuda" else [])
     expected = nearest(points.cpu(), nodes.cpu(), k)

@@ -10,7 +10,7 @@ import torch
 from helpers.cuda_emulation import COMPILER, build, launcher
 from scgs_warp.kernels.cuda import ssim as kernels
 from scgs_warp.kernels.types import SSIM_TILE_COLUMNS, SSIM_TILE_ROWS
-from scgs_warp.ops import compositing_cuda
+from scgs_warp.ops import cuda_blocks
 from scgs_warp.ops.ssim import photometric_loss
 
 emulated = pytest.mark.skipif(COMPILER is None, reason="no C++ compiler, or not Linux, whose fibres the shim uses")
@@ -45,7 +45,7 @@ def run(form: str, image: torch.Tensor, truth: torch.Tensor, mask: torch.Tensor 
 @pytest.mark.parametrize("width", [1, SSIM_TILE_COLUMNS, 2 * SSIM_TILE_COLUMNS + 3])
 def test_same_as_the_pixel_form(width: int, height: int, masked: bool, library: ctypes.CDLL, monkeypatch):
     """Also where a tile ends: its windows reach five pixels into the neighbours."""
-    monkeypatch.setattr(compositing_cuda, "launch_native", launcher(library))
+    monkeypatch.setattr(cuda_blocks, "launch_native", launcher(library))
     image, truth, mask = pair(2, height, width)
     arguments = image, truth, mask if masked else None
     for got, expected in zip(run("cuda", *arguments), run("plain", *arguments)):
@@ -58,7 +58,7 @@ def test_bits_do_not_depend_on_who_runs_first(library: ctypes.CDLL, monkeypatch)
     arguments = pair(3, 2 * SSIM_TILE_ROWS - 3, SSIM_TILE_COLUMNS + 9)
     runs = []
     for seed in (1, 2, 3):
-        monkeypatch.setattr(compositing_cuda, "launch_native", launcher(library, seed))
+        monkeypatch.setattr(cuda_blocks, "launch_native", launcher(library, seed))
         runs.append(run("cuda", *arguments))
     for other in runs[1:]:
         assert all(torch.equal(a, b) for a, b in zip(runs[0], other))
@@ -67,7 +67,7 @@ def test_bits_do_not_depend_on_who_runs_first(library: ctypes.CDLL, monkeypatch)
 @emulated
 def test_sums_of_more_tiles_than_threads(library: ctypes.CDLL, monkeypatch):
     """A thread of the last sum adds several tiles; float32 alone would lose the small ones beside the large one."""
-    monkeypatch.setattr(compositing_cuda, "launch_native", launcher(library))
+    monkeypatch.setattr(cuda_blocks, "launch_native", launcher(library))
     truth = torch.zeros(300, 3, 2)
     image = truth + 1e-4
     image[7] = 1e4
@@ -100,7 +100,7 @@ def test_an_image_without_gradient_stores_none(library: ctypes.CDLL, monkeypatch
         launched.append((kernel.key, [value is None for value in args]))
         inner(kernel, blocks, *args, begin=begin)
 
-    monkeypatch.setattr(compositing_cuda, "launch_native", noting)
+    monkeypatch.setattr(cuda_blocks, "launch_native", noting)
     image, truth, _ = pair(1, 20, 20)
     with_gradient = photometric_loss(image.requires_grad_(), truth, form="cuda")
     with torch.no_grad():
