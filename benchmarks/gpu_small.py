@@ -39,7 +39,7 @@ def main(graphs: bool) -> None:
         for index in range(frame_graph.RECORD_AFTER + 2 if graphs else 1):
             scene.render(camera, 0.1 * index)
         data, state = training_data(scene, SIZE), training_state(scene, True)
-    scene.motion.cache_binding(None)  # type: ignore[operator]
+    scene.motion.cache_binding(None)
     frames = Frames(data, scene.normalisation, state.config, "cuda")
     failed = taken(PlainSteps(state, frames), state, 1)
     failures = [scene.frame_graph().failure]

@@ -130,7 +130,7 @@ def steps_in_turns(arap: bool, count: int, size: tuple[int, int], s: Setting) ->
     taken: dict[str, Any] = {}
     for name in ("recorded", "plain"):
         scene = synthetic_scene("control-points", count, s.nodes, s.device)
-        scene.motion.cache_binding(None)  # type: ignore[operator]
+        scene.motion.cache_binding(None)
         data, state = training_data(scene, size), training_state(scene, arap)
         frames = Frames(data, scene.normalisation, state.config, s.device)
         taken[name] = steps_of(state, frames) if name == "recorded" else PlainSteps(state, frames)

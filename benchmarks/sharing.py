@@ -102,7 +102,7 @@ def main(arguments: list[str] | None) -> None:
     with join_processes(where, device) as group:
         scene = synthetic_scene("control-points", options.gaussians, options.nodes, device)
         data = training_data(scene, options.size)
-        scene.motion.cache_binding(None)  # type: ignore[operator]
+        scene.motion.cache_binding(None)
         state = training_state(scene, arap=False)
         state.group, processes = group, 1 if group is None else group.size
         state.config = replace(state.config, batch=processes)

@@ -85,7 +85,7 @@ def kept(scene: Scene) -> dict[str, Any]:
         UserError: they cannot be interpolated well enough.
     """
     began = time.perf_counter()
-    track = getattr(scene.motion, "kept_poses") if scene.prepare_playback() else None  # noqa: B009
+    track = scene.motion.kept_poses if scene.prepare_playback() else None
     if track is None:
         raise UserError("--playback: this motion cannot be interpolated well enough; leave the option out")
     seconds = time.perf_counter() - began

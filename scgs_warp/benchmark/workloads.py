@@ -167,9 +167,7 @@ def step_rows(case: BenchCase) -> list[dict[str, Any]]:
     for name, arap in (("step", False), ("step/arap", True)):
         if arap and not isinstance(scene.motion, ControlPoints):
             continue
-        cache = getattr(scene.motion, "cache_binding", None)
-        if cache is not None:
-            cache(None)
+        scene.motion.cache_binding(None)
         state = training_state(scene, arap)
         frames = Frames(data, scene.normalisation, state.config, case.plan.device)
         targets = {

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import ClassVar, Literal, NamedTuple
 
 import torch
@@ -12,6 +13,7 @@ from ..gaussians import GaussianParameters
 from ..ops.activations import exponential
 from ..optim import Adam, log_linear
 from ..types import Gaussians
+from .pose_track import PoseTrack
 
 
 class MotionStep(NamedTuple):
@@ -112,6 +114,31 @@ class Motion(nn.Module):
     def control_points_at(self, time: float) -> Tensor:
         """Return the control points [M, 3] at ``time``; [0, 3] for models without control points."""
         return torch.zeros(0, 3)
+
+    def cache_binding(self, gaussians: GaussianParameters | None) -> None:
+        """Keep what the Gaussians' posing has in common at all times, for rendering; with None, discard it. Does
+        nothing in models without control points."""
+
+    def keep_poses(
+        self,
+        gaussians: GaussianParameters,
+        tolerance: float,
+        tell: Callable[[int, int], None] = lambda done, total: None,
+    ) -> bool:
+        """Sample the motion once, so that later poses are interpolated; return whether this is done (False: as in
+        models without control points).
+
+        Args:
+            gaussians: those that the control points move.
+            tolerance: largest error of a position, as a share of the control points' extent.
+            tell: called with the numbers of instants sampled and of all.
+        """
+        return False
+
+    @property
+    def kept_poses(self) -> PoseTrack | None:
+        """The track that poses are interpolated from, if they are kept."""
+        return None
 
     def rates(self, step: int, config: TrainConfig) -> dict[str, float]:
         """Return the learning rate of every named parameter at this main step."""

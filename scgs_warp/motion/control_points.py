@@ -204,8 +204,7 @@ class ControlPoints(Motion):
         return _posed(gaussians, moved, pose, self.config.mask)
 
     def cache_binding(self, gaussians: GaussianParameters | None) -> None:
-        """Keep the Gaussians' neighbours and weights for rendering, as they do not depend on time; with None, discard
-        them."""
+        """Keep the Gaussians' neighbours and weights, which do not depend on time; with None, discard them."""
         with torch.no_grad():
             self._cached = None if gaussians is None else self.binding(gaussians)
         self._cached_for = None if gaussians is None else self._binding_state(gaussians)
@@ -229,11 +228,6 @@ class ControlPoints(Motion):
         As soon as a parameter or a layer is replaced, or a parameter is changed in place, poses are the network's
         again. Changes through ``.data`` are not noticed.
 
-        Args:
-            gaussians: those that the control points move.
-            tolerance: largest error of a position, as a share of the control points' extent.
-            tell: told how many of how many instants are sampled.
-
         Returns:
             Whether poses are kept. False: on a GPU, for parameters that count no changes (inference tensors), if a
             parameter changed meanwhile, and if the tolerance is not met.
@@ -254,7 +248,6 @@ class ControlPoints(Motion):
 
     @property
     def kept_poses(self) -> PoseTrack | None:
-        """The track that poses are interpolated from, if they are kept."""
         return None if self._kept is None else self._kept[0]
 
     def _motion_state(self) -> list[TensorState]:

@@ -108,9 +108,7 @@ class Scene:
 
     def freeze_binding(self) -> None:
         """Compute every Gaussian's control points once, since they do not depend on time."""
-        cache = getattr(self.motion, "cache_binding", None)
-        if cache is not None:
-            cache(self.gaussians)
+        self.motion.cache_binding(self.gaussians)
 
     @unaffected
     def prepare_playback(
@@ -130,8 +128,7 @@ class Scene:
             Whether the motion is interpolated. False: frames are as before, because the scene is on a GPU, its model
             has no control points, or the tolerance is not met.
         """
-        keep = getattr(self.motion, "keep_poses", None)
-        return keep is not None and keep(self.gaussians, tolerance, tell)
+        return self.motion.keep_poses(self.gaussians, tolerance, tell)
 
     @property
     def device(self) -> torch.device:

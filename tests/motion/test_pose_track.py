@@ -176,7 +176,7 @@ def test_kept_poses_do_not_outlive_a_change(change):
 def kept_motion():
     scene = synthetic_scene("control-points", 300, 20, "cpu")
     assert scene.prepare_playback(1e-3)
-    return scene.motion, scene.motion.kept_poses  # type: ignore[union-attr]
+    return scene.motion, scene.motion.kept_poses
 
 
 def test_a_change_while_sampling_keeps_nothing():
@@ -186,7 +186,7 @@ def test_a_change_while_sampling_keeps_nothing():
     def tell(done: int, total: int) -> None:
         scene.motion.log_radii.add_(0.1)  # type: ignore[operator, union-attr]
 
-    assert not scene.prepare_playback(1e-3, tell) and scene.motion.kept_poses is None  # type: ignore[union-attr]
+    assert not scene.prepare_playback(1e-3, tell) and scene.motion.kept_poses is None
 
 
 def test_inference_tensors_are_not_kept():
