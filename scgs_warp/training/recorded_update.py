@@ -22,7 +22,7 @@ from .depth import SeenDepth
 from .silhouettes import SilhouetteSample
 from .state import TrainState
 from .step import least_logit, motion_frozen
-from .view import Numbers, View, compare, form_of
+from .view import Numbers, View, compare, operations_key
 
 RECORD_AFTER = 2
 """Number of steps of one kind that are taken operation by operation, which loads their kernels, before one is
@@ -98,7 +98,7 @@ class RecordedUpdate:
 
     def key(self, view: View) -> Hashable:
         """Return a key for the kind of the state's present step."""
-        return form_of(view, motion_frozen(self._state))
+        return operations_key(view, motion_frozen(self._state))
 
     def numbers(self, view: View) -> Tensor:
         """Gather the numbers that change from step to step, float64 on the host."""

@@ -12,7 +12,6 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ..config.presets import TrainConfig
 from ..motion.base import MotionStep
 from ..ops.pooled import pooled_residual
 from ..ops.ssim import photometric_loss
@@ -29,7 +28,7 @@ from .state import TrainState
 
 
 class View(NamedTuple):
-    """What a step needs of one view. ``form`` and the shapes decide which operations the step consists of."""
+    """What a step needs of one view. ``choices`` and the shapes decide which operations the step consists of."""
 
     index: int
     """Index of the frame."""
@@ -38,7 +37,7 @@ class View(NamedTuple):
     background: Tensor
     """[3] on the host."""
     plan: MotionStep
-    form: Form
+    choices: Choices
     truth: Tensor
     """[3, H, W] on the device, on the background."""
     mask: Tensor | None
@@ -52,8 +51,8 @@ class View(NamedTuple):
     depth_weight: float = 0.0
 
 
-class Form(NamedTuple):
-    """Numbers of a view that choose operations. They change a few times in a run."""
+class Choices(NamedTuple):
+    """What chooses the operations of a view's step. It changes a few times in a run."""
 
     sh_degree: int
     collects: bool
@@ -127,14 +126,14 @@ def prepare(state: TrainState, frames: Frames, view: int = 0) -> View:
     sample = None if loaded.silhouette is None else loaded.silhouette.sample(random)
     pooled = config.pretrain.pooled if pretraining else config.loss.pooled == "always"
     collects = pretraining or step < config.densify.until
-    form = Form(sh_degree(state, step), collects, log_weight(state), pooled)
+    choices = Choices(sh_degree(state, step), collects, log_weight(state), pooled)
     flow = None
     if state.stage == "main" and flow_weight(step, config) > 0.0:
         flow = frames.flows.between(index, generator(config.seed, Purpose.FLOW_FRAME, number))
     weight = depth_weight(step, config) if state.stage == "main" else 0.0
     depth = frames.depths.of(index) if weight > 0.0 else None
     images = loaded.truth, loaded.mask, sample, flow, depth
-    return View(index, loaded.camera, loaded.background, plan, form, *images, depth_weight=weight)
+    return View(index, loaded.camera, loaded.background, plan, choices, *images, depth_weight=weight)
 
 
 def compare(
@@ -150,7 +149,7 @@ def compare(
         stats: what the backward pass adds to, if the step collects statistics.
         binned: as in ``render.draw``.
     """
-    config, camera, form = state.config, numbers.camera, view.form
+    config, camera, choices = state.config, numbers.camera, view.choices
     # 1. Pose: the Gaussians at the frame's time, and the regulariser of the motion.
     posed, regulariser = state.motion.train_at(state.gaussians, view.plan, numbers.times, numbers.weight, config)
     if view.sample is not None:
@@ -162,8 +161,8 @@ def compare(
         posed,
         camera,
         numbers.background,
-        sh_degree=form.sh_degree,
-        stats=stats if form.collects else None,
+        sh_degree=choices.sh_degree,
+        stats=stats if choices.collects else None,
         antialiased=config.antialiased,
         binned=binned,
     )
@@ -177,8 +176,8 @@ def compare(
         regulariser = _plus(regulariser, numbers.flow.weight * flow_term(posed, there, numbers.flow))
     if numbers.depth is not None:
         regulariser = _plus(regulariser, numbers.depth_weight * depth_term(posed, numbers.depth, binned))
-    loss, l1, ssim = photometric_loss(picture, view.truth, view.mask, config.loss.ssim, form.log_weight)
-    if form.pooled:
+    loss, l1, ssim = photometric_loss(picture, view.truth, view.mask, config.loss.ssim, choices.log_weight)
+    if choices.pooled:
         loss = loss + pooled_residual(picture, view.truth, view.mask)
     shown = alpha.detach().amax()
     if may_recall(state) and shows_too_little(float(shown), float(l1.detach())):
@@ -193,12 +192,12 @@ def may_recall(state: TrainState) -> bool:
     return state.config.batch > 1 or state.recalls.holds(state.step)
 
 
-def form_of(view: View, *others: Hashable) -> Hashable:
+def operations_key(view: View, *others: Hashable) -> Hashable:
     """Return a key that is equal for views whose steps consist of the same operations on tensors of the same shapes."""
     distances = None if view.sample is None else view.sample.distances.shape
     depth = None if view.depth is None else view.depth.inverse.shape
     plan = view.plan.phase, len(view.plan.times), view.plan.weight != 0.0
-    return view.form, plan, view.truth.shape, view.mask is None, distances, depth, *others
+    return view.choices, plan, view.truth.shape, view.mask is None, distances, depth, *others
 
 
 def seeks_silhouettes(state: TrainState) -> bool:
@@ -228,12 +227,12 @@ def log_weight(state: TrainState) -> float:
     return config.loss.log_error if state.stage == "main" and state.stage_step >= begins else 0.0
 
 
-def noisy_time(time: float, state: TrainState, frames: int, view: int = 0) -> float:
+def noisy_time(time: float, state: TrainState, frame_count: int, view: int = 0) -> float:
     """Add noise to a view's time, for data in which the cameras move between instants. The noise keeps the motion from
     jumping from frame to frame; it fades until ``optim.network_until``."""
-    config: TrainConfig = state.config
+    config = state.config
     fade = max(0.0, 1.0 - state.stage_step / config.optim.network_until)
-    spread = config.motion.time_noise * fade / max(frames - 1, 1)
+    spread = config.motion.time_noise * fade / max(frame_count - 1, 1)
     if spread == 0.0:
         return time
     noise = torch.randn(1, generator=generator(config.seed, Purpose.TIME_NOISE, view_number(state.step, config, view)))

@@ -11,7 +11,7 @@ import torch
 from helpers.tiny import tiny_config, tiny_dataset
 from scgs_warp.training.frames import Frames
 from scgs_warp.training.state import TrainState
-from scgs_warp.training.view import Form, Numbers, View, compare, noisy_time, prepare
+from scgs_warp.training.view import Choices, Numbers, View, compare, noisy_time, prepare
 
 
 def view_at(step: int, **changes) -> tuple[TrainState, View]:
@@ -25,22 +25,22 @@ def view_at(step: int, **changes) -> tuple[TrainState, View]:
     return state, prepare(state, Frames(data, state.normalisation, state.config, "cpu"))
 
 
-def form_at(step: int, **changes) -> Form:
+def choices_at(step: int, **changes) -> Choices:
     """The form of the view of ``step``."""
-    return view_at(step, **changes)[1].form
+    return view_at(step, **changes)[1].choices
 
 
 @pytest.mark.parametrize(("step", "collects"), [(0, True), (9, True), (10, True), (33, True), (34, False), (49, False)])
 def test_statistics_are_collected_until_densification_ends(step, collects):
-    assert form_at(step, densify={"until": 24}).collects == collects
+    assert choices_at(step, densify={"until": 24}).collects == collects
 
 
 @pytest.mark.parametrize("stage_1", [True, False])
 @pytest.mark.parametrize("main", ["always", "never"])
 def test_each_stage_has_its_own_pooled_residual(stage_1, main):
     changes = {"pretrain": {"pooled": stage_1}, "loss": {"pooled": main}}
-    assert form_at(5, **changes).pooled == stage_1
-    assert form_at(15, **changes).pooled == (main == "always")
+    assert choices_at(5, **changes).pooled == stage_1
+    assert choices_at(15, **changes).pooled == (main == "always")
 
 
 @pytest.mark.parametrize("stage_1", [True, False])
