@@ -22,7 +22,7 @@ from scgs_warp.ops.harmonics import spherical_harmonics
 from scgs_warp.ops.projection import project
 from scgs_warp.rendering.render import render
 from scgs_warp.scene.scene import Scene
-from scgs_warp.training import loop
+from scgs_warp.training import loop, stepping
 from scgs_warp.training.recorded_step import RecordedSteps
 from scgs_warp.types import Camera, Image
 
@@ -156,12 +156,12 @@ def small_run(s: Setting) -> tuple[TrainConfig, Dataset]:
 def steps_of(s: Setting) -> Report:
     """Train three times, the last time without recorded steps, and compare the checkpoints byte by byte."""
     config, data = small_run(s)
-    takers: list[loop.PlainSteps | RecordedSteps] = []
+    takers: list[stepping.PlainSteps | RecordedSteps] = []
     saved = []
     for recorded in (True, True, False):
 
-        def chosen(state, frames, tell, recorded=recorded, choose=loop.steps_of):
-            takers.append(choose(state, frames, tell) if recorded else loop.PlainSteps(state, frames))
+        def chosen(state, frames, tell, recorded=recorded, choose=stepping.steps_of):
+            takers.append(choose(state, frames, tell) if recorded else stepping.PlainSteps(state, frames))
             return takers[-1]
 
         with tempfile.TemporaryDirectory() as folder, mock.patch.object(loop, "steps_of", chosen):

@@ -21,9 +21,9 @@ from scgs_warp.benchmark.scenes import scene_camera, synthetic_scene, training_d
 from scgs_warp.runtime import environment
 from scgs_warp.scene import frame_graph
 from scgs_warp.training.frames import Frames
-from scgs_warp.training.loop import PlainSteps
 from scgs_warp.training.recorded_step import RecordedSteps
 from scgs_warp.training.state import TrainState
+from scgs_warp.training.stepping import PlainSteps
 
 COUNT, NODES, SIZE = 300, 30, (64, 48)
 RECORDED_STEPS = 4

@@ -32,8 +32,8 @@ from scgs_warp.runtime.cuda_graph import CudaGraph
 from scgs_warp.scene.frame_graph import FrameGraph
 from scgs_warp.scene.scene import Scene
 from scgs_warp.training.frames import Frames
-from scgs_warp.training.loop import PlainSteps, steps_of
 from scgs_warp.training.recorded_step import RecordedSteps
+from scgs_warp.training.stepping import PlainSteps, steps_of
 from scgs_warp.types import Camera, Splats
 
 SLOWEST_FORM = 50_000

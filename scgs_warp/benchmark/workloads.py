@@ -23,8 +23,8 @@ from ..scene.scene import Scene
 from ..seeding import generator
 from ..training import view as training_view
 from ..training.frames import Frames
-from ..training.loop import PlainSteps, steps_of
 from ..training.state import StepResult, TrainState
+from ..training.stepping import PlainSteps, steps_of
 from ..types import Camera, Gaussians
 from .plan import MIDDLE, BenchCase, posed
 from .scenes import Size, scene_camera, training_data, training_state

@@ -17,7 +17,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from typing import Protocol
 
 import torch
 from torch import Tensor
@@ -34,7 +33,7 @@ from .frames import Frames
 from .gaussian_density import grow_and_prune, mean_gradient, prune, reset_opacities
 from .near_bound import nearest_content
 from .sphere_density import densify_spheres, densify_spheres_by_gradient, thin_spheres
-from .state import StepResult, TrainState
+from .state import TrainState
 from .visibility import faintest, seen_by
 
 STEPS_PER_VIEW = 20
@@ -164,51 +163,6 @@ def visible_gaussians(state: TrainState, frames: Frames) -> Tensor | None:
     if done == config.until:
         keep &= ~faintest(seen.most, config.faint_share)
     return keep
-
-
-# The step
-
-
-class Steps(Protocol):
-    """Takes the steps of a state. On a GPU, results become known later (``recorded_step``)."""
-
-    def take(self) -> list[StepResult]:
-        """Take the state's next step, and return the results that have become known, in order."""
-        ...
-
-    def settle(self) -> list[StepResult]:
-        """Wait for the steps in flight, and return their results in order."""
-        ...
-
-    def release(self) -> None:
-        """Let go of the state's tensors, which are to be replaced. No step may be in flight."""
-        ...
-
-
-def take_step(
-    state: TrainState, frames: Frames, steps: Steps, results: list[StepResult], settle: bool = False
-) -> Tensor | None:
-    """Measure visibility if pruning is due, then take a step. The caller must call ``control_density`` afterwards if
-    :func:`density_due` was true before.
-
-    Args:
-        steps: takes the steps of the state.
-        results: list to which the results are appended as they become known, those before an error included.
-        settle: wait for the step's own result; where density is due, this is always done.
-
-    Returns:
-        The result of :func:`visible_gaussians`.
-    """
-    due = density_due(state)
-    if due:
-        results += steps.settle()
-    visible = visible_gaussians(state, frames)
-    results += steps.take()
-    if due or settle:
-        results += steps.settle()
-    if due:
-        steps.release()
-    return visible
 
 
 # After a step

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, NoReturn, Protocol
@@ -22,17 +22,16 @@ from ..runtime.memory import NotEnoughMemory
 from ..runtime.progress import Progress, clock, progress
 from ..runtime.stop_signals import stop_signals
 from ..scene.scene import Scene
-from .density_control import Steps, control_density, density_due, take_step
+from .density_control import control_density, density_due
 from .frames import Frames
 from .multi_view import StepInterrupted, check_replicas, check_share
 from .preflight import refuse_data
 from .process_group import ProcessGroup, ProcessLost
-from .recorded_step import RecordedSteps
 from .resuming import as_begun
 from .run_folder import ReadOnlyRunFolder, RunFolder, begin_or_resume, end_here
 from .second_try import try_again
 from .state import StepResult, TrainState
-from .step import training_step
+from .stepping import Steps, steps_of, take_step
 from .turns import add_turns, turns_due
 from .vanishing import refuse_empty, shows_nothing
 
@@ -136,32 +135,6 @@ class Watcher(Protocol):
     def show(self, state: TrainState) -> None: ...
 
 
-class PlainSteps:
-    """Steps whose results are known at once."""
-
-    def __init__(self, state: TrainState, frames: Frames) -> None:
-        self._state, self._frames = state, frames
-
-    def take(self) -> list[StepResult]:
-        """Take the state's next step and return its result."""
-        return [training_step(self._state, self._frames)]
-
-    def settle(self) -> list[StepResult]:
-        """Return nothing: no step is in flight."""
-        return []
-
-    def release(self) -> None:
-        """Do nothing: no tensor is held."""
-
-
-def steps_of(
-    state: TrainState, frames: Frames, tell: Callable[[str], None] = lambda text: None
-) -> PlainSteps | RecordedSteps:
-    """Return what takes the steps of a run: on a GPU without waiting for them, if a step has a single view."""
-    recorded = state.device.type == "cuda" and state.config.batch == 1 and state.group is None
-    return RecordedSteps(state, frames, tell) if recorded else PlainSteps(state, frames)
-
-
 def _train(
     state: TrainState,
     frames: Frames,
@@ -171,18 +144,20 @@ def _train(
     stop: threading.Event,
     watcher: Watcher | None,
 ) -> None:
-    config, noted, steps = state.config, False, steps_of(state, frames, bar.print)
-    saved_at, empty = time.monotonic(), 0
+    """Repeat training steps until the last one, or until a stop is requested."""
+    config, steps = state.config, steps_of(state, frames, bar.print)
+    noted = False  # that memory limits the number of Gaussians
+    saved_at, empty_checks = time.monotonic(), 0
     while state.step < config.steps:
         # 1. Enter the main stage when stage 1 is over.
         if state.stage == "pretrain" and state.step >= config.pretrain_steps:
-            _finish(state, steps, folder, bar)
+            _settle(state, steps, folder, bar)
             steps.release()
             _perhaps_again(state, frames, folder, bar, stop, watcher)
             state.begin_main()
 
         if turns_due(state, frames.data):
-            _finish(state, steps, folder, bar)
+            _settle(state, steps, folder, bar)
             steps.release()
             _add_turns(state, frames, folder, bar, stop)
 
@@ -219,14 +194,14 @@ def _train(
         if last or stopping or state.step % COMPARE_EVERY == 0:
             check_replicas(state)
         if time.monotonic() - saved_at >= config.checkpoint_seconds or last or stopping:
-            _finish(state, steps, folder, bar)
+            _settle(state, steps, folder, bar)
             state.save(folder.path)
             saved_at = time.monotonic()
         if stopping:
             _stop(state, bar)
         if state.step % COMPARE_EVERY == 0 and not last:
-            empty = empty + 1 if shows_nothing(state.scene(), frames.data) else 0
-            if empty == MOST_EMPTY:
+            empty_checks = empty_checks + 1 if shows_nothing(state.scene(), frames.data) else 0
+            if empty_checks == MOST_EMPTY:
                 state.save(folder.path)
                 refuse_empty(state, frames.data, folder.path)
 
@@ -332,7 +307,7 @@ def _take(
         visible = take_step(state, frames, steps, results, looked_at)
         return results, visible
     except (NotEnoughMemory, StepInterrupted, FrameError) as error:
-        _finish(state, steps, folder, bar, results)
+        _settle(state, steps, folder, bar, results)
         state.save(folder.path)
         if isinstance(error, StepInterrupted):
             _stop(state, bar)
@@ -341,7 +316,7 @@ def _take(
         raise  # nothing has changed yet: a machine with more memory can continue
 
 
-def _finish(
+def _settle(
     state: TrainState, steps: Steps, folder: RunFolder, bar: Progress, known: Sequence[StepResult] = ()
 ) -> None:
     """Wait for the steps in flight, and report them after those ``known``."""

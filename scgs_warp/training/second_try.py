@@ -24,12 +24,13 @@ from ..motion.rigidity import tearing
 from ..motion.spheres import Spheres
 from ..ops.sampling import farthest_points
 from ..runtime.environment import one_piece
-from .density_control import Steps, control_density, density_due, take_step
+from .density_control import control_density, density_due
 from .frames import Frames
 from .multi_view import check_replicas
 from .second_try_config import second_config
 from .silhouettes import is_one_piece
 from .state import StepResult, TrainState
+from .stepping import Steps, take_step
 
 VIEWS = 200
 """Largest number of training views by which both tries are compared."""

@@ -11,7 +11,7 @@ from helpers.tiny import tiny_config, tiny_dataset, write_dnerf
 from scgs_warp.config.presets import TrainConfig
 from scgs_warp.errors import UserError
 from scgs_warp.storage import checkpoint
-from scgs_warp.training import loop, run
+from scgs_warp.training import run, stepping
 from scgs_warp.training.loop import fit
 
 STEPS = 40
@@ -46,14 +46,14 @@ def at_step(monkeypatch) -> Callable[[int, Callable[[], object]], None]:
     """Run an action once, before a given step."""
 
     def happen(number: int, action: Callable[[], object]) -> None:
-        inner, left = loop.training_step, [action]
+        inner, left = stepping.training_step, [action]
 
         def step(state, frames):
             if state.step == number and left:
                 left.pop()()
             return inner(state, frames)
 
-        monkeypatch.setattr(loop, "training_step", step)
+        monkeypatch.setattr(stepping, "training_step", step)
 
     return happen
 

@@ -29,7 +29,7 @@ from helpers.tiny import tiny_config, tiny_dataset  # isort: skip
 from scgs_warp.config.presets import TrainConfig
 from scgs_warp.runtime import environment
 from scgs_warp.storage import checkpoint, files
-from scgs_warp.training import density_control, loop
+from scgs_warp.training import density_control, loop, stepping
 from scgs_warp.training.state import TrainState
 
 STEPS = 48
@@ -87,7 +87,7 @@ def always(*_: Any) -> bool:
 
 
 MOMENTS: dict[str, Callable[[], None]] = {
-    "before the first checkpoint": lambda: wrapped(loop, "training_step", nth(4, always)),
+    "before the first checkpoint": lambda: wrapped(stepping, "training_step", nth(4, always)),
     "half a checkpoint": lambda: wrapped(
         files, "write_and_flush", nth(7, lambda path, _: "checkpoint" in path.name, half_written)
     ),
@@ -106,7 +106,7 @@ LATE = ("before the first checkpoint",)
 
 def narrate(tell: Callable[[str], None]) -> None:
     """Report what the run is doing."""
-    wrapped(loop, "training_step", lambda state, _: tell(f"{state.stage} step"))
+    wrapped(stepping, "training_step", lambda state, _: tell(f"{state.stage} step"))
     wrapped(loop, "control_density", lambda state, *_: tell(f"{state.stage} densification, if due"))
     wrapped(TrainState, "begin_main", lambda *_: tell("stage change"))
     wrapped(density_control, "grow_and_prune", lambda *_: tell("main densification"))

@@ -27,7 +27,7 @@ from scgs_warp.data.dataset import Dataset
 from scgs_warp.errors import UserError
 from scgs_warp.runtime import environment
 from scgs_warp.runtime.torchrun import process_rank
-from scgs_warp.training import loop, process_group, second_try_config
+from scgs_warp.training import loop, process_group, second_try_config, stepping
 from scgs_warp.training.frames import Frames
 from scgs_warp.training.loop import fit
 from scgs_warp.training.process_group import ProcessGroup, join_processes
@@ -76,14 +76,14 @@ DATA: dict[str, tuple[TrainConfig, Callable[[], Dataset]]] = {
 
 def at_step(step: int, rank: int, group: ProcessGroup | None, act: Callable[[TrainState], None]) -> None:
     """Have one process do something before a step's views."""
-    original = loop.training_step
+    original = stepping.training_step
 
     def acting(state: TrainState, frames: Frames) -> StepResult:
         if state.step == step and (group is None or group.rank == rank):
             act(state)
         return original(state, frames)
 
-    loop.training_step = acting
+    stepping.training_step = acting
 
 
 def nudge(state: TrainState) -> None:
@@ -122,7 +122,7 @@ def play(name: str, group: ProcessGroup | None, output: Path) -> None:
 def main(arguments: list[str] | None) -> None:
     output, refused = Path(sys.argv[1]), {}
     environment.configure(1)
-    untouched, ports = loop.training_step, os.environ["PORTS"].split()
+    untouched, ports = stepping.training_step, os.environ["PORTS"].split()
     scenarios = sys.argv[2:]
     while scenarios:
         process_group.PATIENCE = SHORT if scenarios[0] == "hung" else timedelta(minutes=2)
@@ -131,7 +131,7 @@ def main(arguments: list[str] | None) -> None:
             assert group is not None
             while scenarios:
                 name = scenarios.pop(0)
-                loop.training_step = untouched
+                stepping.training_step = untouched
                 try:
                     play(name, group, output)
                 except KeyboardInterrupt:

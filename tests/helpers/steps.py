@@ -18,9 +18,10 @@ from scgs_warp.data.dataset import Dataset
 from scgs_warp.runtime import environment
 from scgs_warp.storage import checkpoint
 from scgs_warp.training.frames import Frames
-from scgs_warp.training.loop import PlainSteps, fit
+from scgs_warp.training.loop import fit
 from scgs_warp.training.recorded_step import RecordedSteps
 from scgs_warp.training.state import TrainState
+from scgs_warp.training.stepping import PlainSteps
 
 PRETENDED = bool(os.environ.get("SCGS_PRETENDED_CUDA"))
 """Whether the GPU is the pretended one, which adds in one order."""

@@ -18,7 +18,7 @@ from scgs_warp.evaluation.evaluate import evaluate
 from scgs_warp.evaluation.image_metrics import psnr
 from scgs_warp.scene.scene import Scene
 from scgs_warp.storage import checkpoint
-from scgs_warp.training import loop, step
+from scgs_warp.training import step, stepping
 from scgs_warp.training.frames import Frames
 from scgs_warp.training.gaussian_density import RESET_OPACITY
 from scgs_warp.training.loop import fit
@@ -50,14 +50,14 @@ def test_every_motion_model_learns(model, tmp_path, device):
 def test_the_log_shows_the_regulariser(batch, tmp_path, monkeypatch):
     """Each line has the last value since the line before, as one step in five carries ARAP."""
     values = []
-    step = loop.training_step
+    step = stepping.training_step
 
     def recorded(state, frames):
         result = step(state, frames)
         values.append(result.regulariser)
         return result
 
-    monkeypatch.setattr(loop, "training_step", recorded)
+    monkeypatch.setattr(stepping, "training_step", recorded)
     config = tiny_config(100, batch=batch, pretrain={"silhouette": 0.0}, loss={"arap_until": 100})
     fit(config, tiny_dataset(4), output=tmp_path / "run")
     log = [json.loads(line) for line in (tmp_path / "run/log.jsonl").read_text().splitlines()]
@@ -104,14 +104,14 @@ def test_a_trained_scene_renders_the_same_bits_after_loading(tmp_path, device):
 
 def test_a_run_that_is_stopped_by_sigterm_resumes_to_the_same_bits(tmp_path, monkeypatch):
     data = tiny_dataset(6)
-    step = loop.training_step
+    step = stepping.training_step
 
     def interrupting(state, frames):
         if state.step == 20:
             os.kill(os.getpid(), signal.SIGTERM)
         return step(state, frames)
 
-    monkeypatch.setattr(loop, "training_step", interrupting)
+    monkeypatch.setattr(stepping, "training_step", interrupting)
     with pytest.raises(KeyboardInterrupt):
         fit(tiny_config(60), data, output=tmp_path / "run")
     monkeypatch.undo()

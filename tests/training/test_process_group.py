@@ -23,7 +23,7 @@ from scgs_warp.apps.train import cli
 from scgs_warp.evaluation.evaluate import evaluate
 from scgs_warp.scene.scene import Scene
 from scgs_warp.storage.checkpoint import read
-from scgs_warp.training import loop, second_try_config
+from scgs_warp.training import second_try_config, stepping
 from scgs_warp.training.loop import fit
 
 PATHS = {"PYTHONPATH": f"{ROOT}{os.pathsep}{ROOT / 'tests'}"}
@@ -54,14 +54,14 @@ def start(output: Path, *scenarios: str, processes: int = 2) -> list[subprocess.
 
 
 def stop_at(step: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    original = loop.training_step
+    original = stepping.training_step
 
     def stopping(state, frames):
         if state.step == step:
             os.kill(os.getpid(), signal.SIGTERM)
         return original(state, frames)
 
-    monkeypatch.setattr(loop, "training_step", stopping)
+    monkeypatch.setattr(stepping, "training_step", stopping)
 
 
 @pytest.fixture(scope="module")

@@ -18,7 +18,7 @@ from scgs_warp.config.presets import preset
 from scgs_warp.data.dataset import Dataset
 from scgs_warp.errors import FrameError, UserError
 from scgs_warp.evaluation.image_metrics import psnr
-from scgs_warp.training import loop, second_try, second_try_config
+from scgs_warp.training import loop, second_try, second_try_config, stepping
 from scgs_warp.training.automatic import resolve_auto
 from scgs_warp.training.loop import fit
 from scgs_warp.training.second_try_config import may_be_tried_again
@@ -292,13 +292,13 @@ def test_the_second_try_goes_frame_by_frame_whatever_the_first_did(tried, tmp_pa
 
 
 def test_a_second_try_that_is_not_finite_is_given_up(tried, tmp_path, monkeypatch):
-    step = loop.training_step
+    step = stepping.training_step
 
     def spoilt(state, frames):
         result = step(state, frames)
         return result._replace(failed="the loss") if state.config.pretrain.arap_by == "moment" else result
 
-    monkeypatch.setattr(loop, "training_step", spoilt)
+    monkeypatch.setattr(stepping, "training_step", spoilt)
     fit(CONFIG, tiny_dataset(6), output=tmp_path / "run")
     assert notes_of(tmp_path / "run") == ["the loss is not finite the second time; the first motion is kept"]
 

@@ -49,9 +49,9 @@ def logged(folder: Path) -> dict[str, list[tuple[int, float]]]:
 
 def cut(folder: Path, at: int, monkeypatch: pytest.MonkeyPatch, saved: int, **options) -> None:
     """A run whose last checkpoint is of step ``saved`` and that dies at step ``at``."""
-    from scgs_warp.training import loop
+    from scgs_warp.training import stepping
 
-    save, step = TrainState.save, loop.training_step
+    save, step = TrainState.save, stepping.training_step
 
     def dies(state, frames):
         if state.step == at:
@@ -63,7 +63,7 @@ def cut(folder: Path, at: int, monkeypatch: pytest.MonkeyPatch, saved: int, **op
             save(self, path)
 
     with monkeypatch.context() as patch:
-        patch.setattr(loop, "training_step", dies)
+        patch.setattr(stepping, "training_step", dies)
         patch.setattr(TrainState, "save", saves)
         config = tiny_config(STEPS, evaluate_every=60, checkpoint_seconds=0.0)
         with pytest.raises(MemoryError):
