@@ -21,6 +21,9 @@ from .types import ALPHA_MAX, ALPHA_MIN, CHANNEL_MAX, SLOT_GEOMETRY, STEP_FINE, 
 
 wp.set_module_options({"enable_backward": False})
 
+SLOT_WIDTH = 16
+"""Number of columns of a slot that fills one cache line and holds up to 8 channels."""
+
 
 @wp.func
 def squared_distance(conic: wp.vec3, d: wp.vec2) -> float:
@@ -239,10 +242,6 @@ def sum_slots(
     v_opacities_out[i] = passed(v_opacity)
     if absgrad_out.shape[0] > 0:
         absgrad_out[i] = passed(absolute)
-
-
-SLOT_WIDTH = 16
-"""Number of columns of a slot that fills one cache line and holds up to 8 channels."""
 
 
 @wp.kernel

@@ -40,8 +40,8 @@ def not_negative(color: float) -> float:
 
 
 @wp.func
-def passed(color: float, v: float) -> float:
-    """Return the colour's gradient, or 0 where the colour was clamped or is non-finite."""
+def not_negative_adjoint(color: float, v: float) -> float:
+    """Return the gradient ``v`` of a clamped colour, or 0 where it was clamped or is non-finite."""
     return wp.where(color > 0.0 and wp.isfinite(color), v, 0.0)
 
 
@@ -150,7 +150,11 @@ def spherical_harmonics_adjoint(
     end = (i + 1) * rest_row
     color = colors_in[i]
     v = v_colors_in[i]
-    v = wp.vec3(passed(color[0], v[0]), passed(color[1], v[1]), passed(color[2], v[2]))
+    v = wp.vec3(
+        not_negative_adjoint(color[0], v[0]),
+        not_negative_adjoint(color[1], v[1]),
+        not_negative_adjoint(color[2], v[2]),
+    )
     v_sh_dc_out[i * dc_row] = C0 * v
     if has_means != 0:
         v_means_out[i] = wp.vec3(0.0)

@@ -12,6 +12,8 @@ from .gradient_limits import passed
 wp.set_module_options({"enable_backward": False, "default_grid_stride": False})
 
 MAX_NEIGHBORS = 16
+MIN_STRENGTH = wp.constant(1.0e-30)
+"""Strength that smaller ones count as, so that the logarithm stays finite."""
 
 
 @wp.kernel
@@ -132,9 +134,6 @@ def rbf_weights(
         total += w
     for k in range(K):
         weights_out[i, k] = weights_out[i, k] / total
-
-
-MIN_STRENGTH = wp.constant(1.0e-30)
 
 
 @wp.kernel

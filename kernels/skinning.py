@@ -202,7 +202,6 @@ def _add(
     k: int,
     row: int,
     means: wp.array[wp.vec3],
-    quats: wp.array[wp.vec4],
     nodes: wp.array[wp.vec3],
     shapes: wp.array[wp.vec4],
     indices: wp.array2d[wp.int32],
@@ -214,13 +213,12 @@ def _add(
     sums: wp.array2d[float],
 ):
     """Add the pair of Gaussian i and its k-th neighbour to that node's sums."""
-    x = means[i]
     if not finite(v_blends[i]):
         return
     m = indices[i, k]
     w = weights[i, k]
     v = w * v_means[i]
-    arm = x - nodes[m]
+    arm = means[i] - nodes[m]
     for a in range(3):
         for c in range(3):
             sums[row, 3 * a + c] = sums[row, 3 * a + c] + v[a] * arm[c]
@@ -242,7 +240,6 @@ def skin_reduce_chunks(
     # In:
     size: int,  # Gaussians a chunk
     means_in: wp.array[wp.vec3],  # [N]
-    quats_in: wp.array[wp.vec4],  # [N]
     nodes_in: wp.array[wp.vec3],  # [M]
     shape_rotations_in: wp.array[wp.vec4],  # [M]
     indices_in: wp.array2d[wp.int32],  # [N, K]
@@ -261,7 +258,7 @@ def skin_reduce_chunks(
         for k in range(indices_in.shape[1]):
             row = chunk * M + indices_in[i, k]
             _add(
-                i, k, row, means_in, quats_in, nodes_in, shape_rotations_in, indices_in, weights_in,
+                i, k, row, means_in, nodes_in, shape_rotations_in, indices_in, weights_in,
                 v_means_in, v_blends_in, v_extras_in, has_extras, sums_out,
             )  # fmt: skip
 

@@ -44,7 +44,6 @@ def skin_segments(
     # In:
     order_in: wp.array[wp.int32],  # [N * K] pairs i * K + k sorted by node
     means_in: wp.array[wp.vec3],  # [N]
-    quats_in: wp.array[wp.vec4],  # [N]
     nodes_in: wp.array[wp.vec3],  # [M]
     shape_rotations_in: wp.array[wp.vec4],  # [M]
     indices_in: wp.array2d[wp.int32],  # [N, K]
@@ -76,11 +75,10 @@ def skin_segments(
             v_sum = wp.vec3(0.0)
             blend = wp.vec4(0.0)
             extra = wp.vec3(0.0)
-        x = means_in[i]
         if finite(v_blends_in[i]):
             w = weights_in[i, k]
             v = w * v_means_in[i]
-            G += wp.outer(v, x - nodes_in[m])
+            G += wp.outer(v, means_in[i] - nodes_in[m])
             v_sum += v
             if has_extras != 0:
                 extra += w * v_extras_in[i]

@@ -159,7 +159,7 @@ class Engine:
             if problem is None:
                 return self._unbent(edit, time)
             rest = problem.base.positions
-            sweeps = [goal.sweep(rest) for goal in problem.goals]
+            sweeps = [goal.sweep() for goal in problem.goals]
             steps = max(count_steps(turned, moved, self.graph.edge_length) for turned, moved in sweeps)
             path = lambda share: anchors_at(problem.goals, problem.pins, rest, share)  # noqa: E731
             return self._finish(problem, problem.solver.solve(rest, path, steps))

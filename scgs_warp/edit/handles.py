@@ -199,7 +199,7 @@ class Goal(NamedTuple):
             turns = multiply(turns, power(self.own_turns, share))
         return positions, to_matrix(turns)
 
-    def sweep(self, rest: np.ndarray) -> tuple[float, float]:
+    def sweep(self) -> tuple[float, float]:
         """Return the angle in radians and the distance that the goal covers, which decide the number of sub-steps."""
         distance = float(np.linalg.norm(self.translation))
         if self.residual is not None:

@@ -40,7 +40,7 @@ class Player:
             goal, color_turns = self._goal(hold, time, now, exaggerate)
             goals.append(goal)
             color_turns_of.append(color_turns)
-        sweeps = [goal.sweep(rest) for goal in goals]
+        sweeps = [goal.sweep() for goal in goals]
         steps = max(count_steps(turned, moved, self.graph.edge_length) for turned, moved in sweeps)
         shape = self.solver.solve(rest, lambda share: anchors_at(goals, pins, rest, share), steps)
         held = ~near

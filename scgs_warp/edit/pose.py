@@ -28,7 +28,7 @@ class Rig(Protocol):
     def trajectories(self, times: Tensor) -> Tensor: ...
     def binding(self, gaussians: GaussianParameters) -> tuple[Tensor, Tensor]: ...
     def apply_pose(
-        self, gaussians: GaussianParameters, pose: Pose, binding: tuple[Tensor, Tensor], own: Pose | None = None
+        self, gaussians: GaussianParameters, pose: Pose, binding: tuple[Tensor, Tensor], own_pose: Pose | None = None
     ) -> Gaussians: ...
 
 
@@ -86,18 +86,18 @@ def motion_pose(rig: Rig, time: float) -> MotionPose:
 def compose(motion: MotionPose, bent: NodePose) -> Pose:
     """Compose motion and edit into the pose that skinning takes. The pose of unedited control points is bit-identical
     to the motion's."""
-    own = motion.pose
-    device = own.translations.device
+    trained = motion.pose
+    device = trained.translations.device
     shift = torch.from_numpy(bent.positions - motion.positions).float().to(device)
-    moved = torch.where(shift != 0, own.translations + shift, own.translations)
+    moved = torch.where(shift != 0, trained.translations + shift, trained.translations)
     turned = torch.from_numpy(bent.turns[:, 1:].any(1)).to(device)[:, None]
 
     def turn(rotations: Tensor) -> Tensor:
         further = multiply(bent.turns, rotations.detach().cpu().double().numpy())
         return torch.where(turned, torch.from_numpy(further).float().to(device), rotations)
 
-    shape = None if own.shape_rotations is None else turn(own.shape_rotations)
-    return Pose(moved.contiguous(), turn(own.rotations).contiguous(), shape, own.log_scales, own.tints)
+    shape = None if trained.shape_rotations is None else turn(trained.shape_rotations)
+    return Pose(moved.contiguous(), turn(trained.rotations).contiguous(), shape, trained.log_scales, trained.tints)
 
 
 def own_pose(motion: MotionPose, bent: NodePose) -> Pose | None:
@@ -139,8 +139,8 @@ def pose_gaussians(
             return _with_parts(posed, bent, bent.base, bent.skin)
         return _on_top(posed, gaussians, bent, bent.base, binding)
     learnt = gaussians.shading.shape[1] or gaussians.correctives.shape[1]
-    own = own_pose(motion, bent) if learnt else None
-    posed = rig.apply_pose(gaussians, compose(motion, bent), binding, own)
+    followed = own_pose(motion, bent) if learnt else None
+    posed = rig.apply_pose(gaussians, compose(motion, bent), binding, followed)
     if not bent.color_turns[:, 1:].any():
         return posed
     sh_rest = posed.sh_rest

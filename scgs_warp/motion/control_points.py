@@ -77,7 +77,7 @@ def _posed(
     moved: tuple[Tensor, Tensor, Tensor | None],
     pose: Pose,
     masked: bool,
-    own: Tensor | None = None,
+    quats_own: Tensor | None = None,
 ) -> Gaussians:
     """Activate the moved Gaussians.
 
@@ -85,25 +85,26 @@ def _posed(
         moved: means, quats, and log scales or tints, from skinning.
         pose: of the control points that moved them.
         masked: the last hyper-coordinate is the logit of the share of the motion that a Gaussian takes.
-        own: [N, 4] rotations that shading and correctives follow in place of the moved ones: those of the trained
+        quats_own: [N, 4] rotations that shading and correctives follow in place of the moved ones: those of the trained
             motion, under an edit.
     """
     means, quats, extras = moved
     rest = gaussians.rest()
     if masked:
         if gaussians.correctives.shape[1]:
-            means = correct(means, gaussians.correctives, gaussians.quats, quats, own)
+            means = correct(means, gaussians.correctives, gaussians.quats, quats, quats_own)
             rest = *rest[:5], gaussians.correctives.detach()[:, :0], rest[6]
         share = sigmoid(gaussians.hyper[:, -1:])
         still = F.normalize(gaussians.quats, dim=1)
         still = torch.where((still * quats).sum(1, keepdim=True) < 0, -still, still)
         means = gaussians.means + share * (means - gaussians.means)
         quats = still + share * (quats - still)
-        if own is not None:
-            own = still + share * (torch.where((still * own).sum(1, keepdim=True) < 0, -own, own) - still)
+        if quats_own is not None:
+            quats_own = torch.where((still * quats_own).sum(1, keepdim=True) < 0, -quats_own, quats_own)
+            quats_own = still + share * (quats_own - still)
         extras = None if extras is None else share * extras
     log_scales, tints = (extras, None) if pose.tints is None else (None, extras)
-    means, scales, opacities, sh_dc = finish(means, quats, rest, log_scales, tints, own)
+    means, scales, opacities, sh_dc = finish(means, quats, rest, log_scales, tints, quats_own)
     return Gaussians(means, quats, scales, opacities, sh_dc, gaussians.sh_rest, gaussians.sharpness)
 
 
@@ -169,18 +170,17 @@ class ControlPoints(Motion):
         gaussians: GaussianParameters,
         pose: Pose,
         binding: tuple[Tensor, Tensor],
-        own: Pose | None = None,
+        own_pose: Pose | None = None,
     ) -> Gaussians:
         """Move all Gaussians by linear blend skinning (Eq. 6-7). Editing replaces only ``pose``; shading and
-        correctives follow the rotations of ``own`` if given, those of the trained motion."""
+        correctives follow the rotations of ``own_pose`` if given, those of the trained motion."""
+        rotations = None
+        if own_pose is not None:
+            rotations = skin(gaussians.means, gaussians.quats, self.positions, own_pose, *binding)[1]
         if not (torch.is_grad_enabled() or self.config.mask):
-            rotations = (
-                None if own is None else skin(gaussians.means, gaussians.quats, self.positions, own, *binding)[1]
-            )
             moved = pose_gaussians(gaussians.rest(), self.positions, pose, *binding, rotations)
             return Gaussians(*moved, gaussians.sh_rest, gaussians.sharpness)
         moved = skin(gaussians.means, gaussians.quats, self.positions, pose, *binding)
-        rotations = None if own is None else skin(gaussians.means, gaussians.quats, self.positions, own, *binding)[1]
         return _posed(gaussians, moved, pose, self.config.mask, rotations)
 
     def bind_and_pose(self, gaussians: GaussianParameters, pose: Pose, frozen: bool) -> Gaussians:

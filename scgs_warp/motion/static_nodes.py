@@ -96,10 +96,10 @@ class StaticNodes(Motion):
         gaussians: GaussianParameters,
         pose: Pose,
         binding: tuple[Tensor, Tensor],
-        own: Pose | None = None,
+        own_pose: Pose | None = None,
     ) -> Gaussians:
         """Move all Gaussians by linear blend skinning (SC-GS, Eq. 6-7). Gaussians whose control points have not moved
-        stay bit-identical. ``own`` has no effect: nothing follows the rotations of a scene that does not move."""
+        stay bit-identical. ``own_pose`` has no effect: nothing follows the rotations of a scene that does not move."""
         means, quats, _ = skin(gaussians.means.detach(), gaussians.quats.detach(), self.positions, pose, *binding)
         rest = gaussians.activate()
         moved = pose.translations.any(dim=1) | pose.rotations[:, 1:].any(dim=1)

@@ -20,30 +20,30 @@ COLUMNS = 27
 
 class _Correct(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, means: Tensor, correctives: Tensor, quats: Tensor, quats_t: Tensor, own, form: Form):
+    def forward(ctx: Any, means: Tensor, correctives: Tensor, quats: Tensor, quats_t: Tensor, quats_own, form: Form):
         corrected, count = torch.empty_like(means), means.shape[0]
         if form == "cpu":
-            turns = quats, quats_t, own, int(own is not None)
+            turns = quats, quats_t, quats_own, int(quats_own is not None)
             launch(cpu_kernels.correct, -(-count // LANES), means, correctives, *turns, corrected, grain=32)
         else:
-            turns = quats, quats_t, quats_t if own is None else own
+            turns = quats, quats_t, quats_t if quats_own is None else quats_own
             launch(kernels.correct, count, means, correctives, *turns, corrected)
-        ctx.save_for_backward(correctives, quats, quats_t, own)
+        ctx.save_for_backward(correctives, quats, quats_t, quats_own)
         ctx.form = form
         return corrected
 
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, v_corrected: Tensor):  # type: ignore[override]
-        correctives, quats, quats_t, own = ctx.saved_tensors
+        correctives, quats, quats_t, quats_own = ctx.saved_tensors
         v_corrected, v_correctives = v_corrected.contiguous(), torch.empty_like(correctives)
         count = len(correctives)
         if ctx.form == "cpu":
-            turns = quats, quats_t, own, int(own is not None)
+            turns = quats, quats_t, quats_own, int(quats_own is not None)
             gradients = v_corrected, v_correctives
             launch(cpu_kernels.correct_adjoint, -(-count // LANES), correctives, *turns, *gradients, grain=32)
         else:
-            turns = quats, quats_t, quats_t if own is None else own
+            turns = quats, quats_t, quats_t if quats_own is None else quats_own
             launch(kernels.correct_adjoint, count, correctives, *turns, v_corrected, v_correctives)
         return v_corrected, v_correctives, None, None, None, None
 

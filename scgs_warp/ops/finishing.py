@@ -28,7 +28,7 @@ def finish(
     rest: tuple[Tensor, ...],
     log_scales: Tensor | None = None,
     tints: Tensor | None = None,
-    own: Tensor | None = None,
+    quats_own: Tensor | None = None,
     *,
     form: Form = "auto",
 ) -> Finished:
@@ -40,7 +40,7 @@ def finish(
         rest: as for :func:`..posing.pose_gaussians`; of the means at rest, only the number is read.
         log_scales: [N, 3] to be added to those at rest.
         tints: [N, 3] changes of the logarithms of the colours; not both.
-        own: [N, 4] wxyz, any norm: rotations that correctives and shading follow instead of ``quats_t``.
+        quats_own: [N, 4] wxyz, any norm: rotations that correctives and shading follow instead of ``quats_t``.
         form: ``plain`` runs a function for each part, on any device; ``cpu`` runs one kernel in SIMD, with the same
             bits as the parts on a CPU; ``auto`` takes the fastest for the device.
 
@@ -52,12 +52,12 @@ def finish(
     Raises:
         ValueError: a shape or the form is wrong, or there are both log scales and tints.
     """
-    _check(means, quats_t, rest, log_scales, tints, own)
+    _check(means, quats_t, rest, log_scales, tints, quats_own)
     if chosen_form(form, means.device) == "plain":
-        return _in_parts(means, quats_t, rest, log_scales, tints, own)
+        return _in_parts(means, quats_t, rest, log_scales, tints, quats_own)
     _, quats, rest_scales, logits, sh_dc, correctives, shading = rest
     extras, kind = (log_scales, LOG_SCALES) if tints is None else (tints, TINTS)
-    turns = quats.detach(), quats_t.detach(), None if own is None else own.detach()
+    turns = quats.detach(), quats_t.detach(), None if quats_own is None else quats_own.detach()
     learnt = rest_scales, logits, sh_dc, correctives, shading, extras
     kind = 0 if extras is None else int(kind)
     found: Any = _Finish.apply(means if correctives.shape[1] else None, *learnt, *turns, kind)
@@ -65,15 +65,15 @@ def finish(
     return means if displaced is None else displaced, scales, opacities, sh_dc if colored is None else colored
 
 
-def _in_parts(means: Tensor, quats_t: Tensor, rest: tuple[Tensor, ...], log_scales, tints, own) -> Finished:
+def _in_parts(means: Tensor, quats_t: Tensor, rest: tuple[Tensor, ...], log_scales, tints, quats_own) -> Finished:
     _, quats, rest_scales, logits, sh_dc, correctives, shading = rest
     if correctives.shape[1]:
-        means = correct(means, correctives, quats, quats_t, own)
+        means = correct(means, correctives, quats, quats_t, quats_own)
     scales = exponential(rest_scales if log_scales is None else rest_scales + log_scales)
     if tints is not None:
         sh_dc = tint(sh_dc, tints)
     if shading.shape[1]:
-        sh_dc = shade(sh_dc, shading, quats, quats_t if own is None else own)
+        sh_dc = shade(sh_dc, shading, quats, quats_t if quats_own is None else quats_own)
     return means, scales, sigmoid(logits), sh_dc
 
 
@@ -82,20 +82,22 @@ class _Finish(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        ctx: Any, means, log_scales, logits, sh_dc, correctives, shading, extras, quats, quats_t, own, kind: int
+        ctx: Any, means, log_scales, logits, sh_dc, correctives, shading, extras, quats, quats_t, quats_own, kind: int
     ):
         log_scales, logits, sh_dc = (value.contiguous() for value in (log_scales, logits, sh_dc))
         correctives, shading, quats, quats_t = (x.contiguous() for x in (correctives, shading, quats, quats_t))
-        means, extras, own = (None if value is None else value.contiguous() for value in (means, extras, own))
+        means, extras, quats_own = (
+            None if value is None else value.contiguous() for value in (means, extras, quats_own)
+        )
         displaced = None if means is None else torch.empty_like(means)
         colored = torch.empty_like(sh_dc) if kind == TINTS or shading.shape[1] else None
         scales, opacities = torch.empty_like(log_scales), torch.empty_like(logits)
         inputs = means, log_scales, logits, sh_dc, correctives, shading, extras, kind
-        turns = quats, quats_t, own, int(own is not None)
+        turns = quats, quats_t, quats_own, int(quats_own is not None)
         outputs = displaced, scales, opacities, colored
         launch(cpu_kernels.finish, -(-len(scales) // LANES), *inputs, *turns, *outputs, grain=32)
         tints = extras if kind == TINTS else None
-        ctx.save_for_backward(scales, opacities, sh_dc, correctives, shading, tints, quats, quats_t, own)
+        ctx.save_for_backward(scales, opacities, sh_dc, correctives, shading, tints, quats, quats_t, quats_own)
         ctx.kind = kind
         ctx.set_materialize_grads(False)
         return outputs
@@ -103,7 +105,7 @@ class _Finish(torch.autograd.Function):
     @staticmethod
     @torch.autograd.function.once_differentiable
     def backward(ctx: Any, *gradients):  # type: ignore[override]
-        scales, opacities, sh_dc, correctives, shading, tints, quats, quats_t, own = ctx.saved_tensors
+        scales, opacities, sh_dc, correctives, shading, tints, quats, quats_t, quats_own = ctx.saved_tensors
         v_means, v_scales, v_opacities, v_colors = (None if v is None else v.contiguous() for v in gradients)
         # What has no gradient passes none on.
         v_log_scales = None if v_scales is None else torch.empty_like(scales)
@@ -113,7 +115,7 @@ class _Finish(torch.autograd.Function):
         v_tints = None if v_colors is None or tints is None else torch.empty_like(tints)
         v_sh_dc = None if v_colors is None else torch.empty_like(sh_dc)
         inputs = scales, opacities, sh_dc, correctives, shading, tints, ctx.kind
-        turns = quats, quats_t, own, int(own is not None)
+        turns = quats, quats_t, quats_own, int(quats_own is not None)
         v_finished = v_means, v_scales, v_opacities, v_colors
         v_rest = v_log_scales, v_logits, v_sh_dc, v_correctives, v_shading
         launch(
@@ -126,21 +128,21 @@ class _Finish(torch.autograd.Function):
         return v_means, *v_rest, v_extras, None, None, None, None
 
 
-def check_rest(rest: tuple[Tensor, ...], own: Tensor | None) -> None:
-    """Check the shapes of the raw parameters after the first two, and of ``own``, as :func:`finish` declares them.
+def check_rest(rest: tuple[Tensor, ...], quats_own: Tensor | None) -> None:
+    """Check the shapes of the raw parameters after the first two, and of ``quats_own``, as for :func:`finish`.
 
     Raises:
         ValueError: a shape is wrong.
     """
-    count, names = len(rest[0]), ("log_scales", "opacity_logits", "sh_dc", "correctives", "shading", "own")
+    count, names = len(rest[0]), ("log_scales", "opacity_logits", "sh_dc", "correctives", "shading", "quats_own")
     correctives, shading = ([(count, width), (count, 0)] for width in (CORRECTIVE_COLUMNS, SHADING_COLUMNS))
     shapes = [(count, 3)], [(count,)], [(count, 3)], correctives, shading, [(count, 4)]
-    for name, value, allowed in zip(names, (*rest[2:], own), shapes, strict=True):
+    for name, value, allowed in zip(names, (*rest[2:], quats_own), shapes, strict=True):
         if value is not None and tuple(value.shape) not in allowed:
             raise ValueError(f"{name} must be {' or '.join(str([*x]) for x in allowed)}, got {tuple(value.shape)}")
 
 
-def _check(means: Tensor, quats_t: Tensor, rest: tuple[Tensor, ...], log_scales, tints, own) -> None:
+def _check(means: Tensor, quats_t: Tensor, rest: tuple[Tensor, ...], log_scales, tints, quats_own) -> None:
     count = len(rest[0])
     expected = {
         "means": (means, (count, 3)),
@@ -152,4 +154,4 @@ def _check(means: Tensor, quats_t: Tensor, rest: tuple[Tensor, ...], log_scales,
     check_shapes(expected)
     if log_scales is not None and tints is not None:
         raise ValueError("there are log_scales or tints, not both")
-    check_rest(rest, own)
+    check_rest(rest, quats_own)

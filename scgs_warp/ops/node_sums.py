@@ -13,8 +13,8 @@ from ..runtime.launch import launch
 def skin_node_sums(order: Tensor, begin: Tensor, pairs: tuple, has_extras: int) -> Tensor:
     """Return the sums [M, SUMS] for ``skin_finish``, with 3 more columns if there are extras.
 
-    ``pairs`` are the arguments of ``skin_segments`` from ``means_in`` on; the third of them is ``nodes``."""
-    rows = _rows(order, pairs[2], SUMS + 3 * has_extras)
+    ``pairs`` are the arguments of ``skin_segments`` from ``means_in`` on; the second of them is ``nodes``."""
+    rows = _rows(order, pairs[1], SUMS + 3 * has_extras)
     launch(kernels.skin_segments, _segments(order), order, *pairs, rows, grain=8)
     return _sum(begin, rows)
 

@@ -77,7 +77,7 @@ def pose_gaussians(
     pose: Pose,
     indices: Tensor,
     weights: Tensor,
-    own: Tensor | None = None,
+    quats_own: Tensor | None = None,
     *,
     form: Form = "auto",
 ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
@@ -90,7 +90,7 @@ def pose_gaussians(
         pose: of the M control points.
         indices: [N, K] int32 nearest control points of each Gaussian.
         weights: [N, K] their weights; rows sum to 1.
-        own: [N, 4] wxyz, any norm: rotations that correctives and shading follow instead of the moved ones.
+        quats_own: [N, 4] wxyz, any norm: rotations that correctives and shading follow instead of the moved ones.
         form: kernels to run: ``plain`` on any device, ``cpu`` in SIMD; ``auto`` takes the fastest for the device.
 
     Returns:
@@ -101,14 +101,14 @@ def pose_gaussians(
         ValueError: a shape or the form is wrong, or there are more neighbours than the form takes.
     """
     check_inputs(rest[0], rest[1], nodes, pose, indices, weights)
-    check_rest(rest, own)
+    check_rest(rest, quats_own)
     if form == "cpu" and indices.shape[1] > MAX_NEIGHBORS:
         raise ValueError(f"form cpu takes up to {MAX_NEIGHBORS} neighbours, got {indices.shape[1]}")
     translations, rotations, shapes, extras = (None if x is None else x.contiguous() for x in pose_tensors(pose))
     kind = int(0 if extras is None else kernels.LOG_SCALES if pose.tints is None else kernels.TINTS)
-    own, count = None if own is None else own.contiguous(), len(rest[0])
+    quats_own, count = None if quats_own is None else quats_own.contiguous(), len(rest[0])
     rest, nodes = tuple(value.detach().contiguous() for value in rest), nodes.detach().contiguous()
-    binding = indices.contiguous(), weights.contiguous(), own, int(own is not None)
+    binding = indices.contiguous(), weights.contiguous(), quats_own, int(quats_own is not None)
     means, quats, scales, opacities, sh_dc = (torch.empty_like(value) for value in rest[:5])
     posed = means, quats, scales, opacities, sh_dc
     if form == "auto" and indices.shape[1] > MAX_NEIGHBORS:

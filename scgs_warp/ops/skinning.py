@@ -40,7 +40,7 @@ class _Skin(torch.autograd.Function):
         inputs = means, quats, nodes, translations, rotations, both, extras, has_extras, indices, weights
         own = v_means, v_quats, v_weights, v_blends
         launch(kernels.skin_adjoint, means.shape[0], *inputs, *v_outputs, *own)
-        pairs = means, quats, nodes, both, indices, weights, v_outputs[0], v_blends, v_outputs[2], has_extras
+        pairs = means, nodes, both, indices, weights, v_outputs[0], v_blends, v_outputs[2], has_extras
         chunks, sums = _node_sums(pairs, has_extras, ctx.lists)
         v_nodes, v_translations, v_rotations = (torch.empty_like(x) for x in (nodes, translations, rotations))
         v_shapes = None if shapes is None else torch.empty_like(shapes)
@@ -67,7 +67,7 @@ def _skin_lanes(means, quats, nodes, translations, rotations, shapes, extras, we
 
 def _node_sums(pairs: tuple, has_extras: int, lists: NodeLists | None) -> tuple[int, Tensor]:
     """Sum the nodes' gradients in parts, and return the number of parts and their buffer [parts * M, columns]."""
-    means, nodes, indices = pairs[0], pairs[2], pairs[4]
+    means, nodes, indices = pairs[0], pairs[1], pairs[3]
     count, width = nodes.shape[0], kernels.SUMS + 3 * has_extras
     if lists is None and means.device.type == "cpu":
         size = chunk_size(count)

@@ -136,7 +136,7 @@ def test_two_free_groups_pull_a_bar_straight():
     ends = np.flatnonzero(rest[:, 0] < -3), np.flatnonzero(rest[:, 0] > 3)
     turn = from_axis(Z, 60)
     goals = [free(end, rest, rotate(turn, rest[end].mean(0))) for end in ends]
-    steps = count_steps(0.0, max(goal.sweep(rest)[1] for goal in goals), graph.edge_length)
+    steps = count_steps(0.0, max(goal.sweep()[1] for goal in goals), graph.edge_length)
     found = ArapSolver(graph).solve(rest, lambda share: anchors_at(goals, np.zeros(0, np.int64), rest, share), steps)
     for end in ends:
         off = from_matrix(found.rotations[end] @ to_matrix(turn).T)

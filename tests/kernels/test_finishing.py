@@ -20,9 +20,9 @@ from scgs_warp.types import Pose
 
 NAMES = (
     *("means", "quats_t", "rest means", "quats", "log_scales", "opacity_logits", "sh_dc", "correctives", "shading"),
-    *("added log_scales", "tints", "own"),
+    *("added log_scales", "tints", "quats_own"),
 )
-LEARNT = [name for name in NAMES if name not in ("quats_t", "rest means", "quats", "own")]
+LEARNT = [name for name in NAMES if name not in ("quats_t", "rest means", "quats", "quats_own")]
 OUTPUTS = ("means", "scales", "opacities", "sh_dc")
 WIDTHS = {"means": 3, "quats_t": 4, "rest means": 3, "quats": 4, "log_scales": 3, "opacity_logits": 1, "sh_dc": 3}
 SIZES = [0, 1, 15, 16, 257]
@@ -46,7 +46,7 @@ def draw(n: int, corrected=True, shaded=True, extras: str | None = "tints", edit
     for name in ("added log_scales", "tints"):
         found[name] = 1.7 * found[name] if name == extras else None  # tints beyond both limits
     own = torch.randn(n, 4, generator=g)
-    return {**found, "opacity_logits": 3.0 * found["opacity_logits"][:, 0], "own": own if edited else None}
+    return {**found, "opacity_logits": 3.0 * found["opacity_logits"][:, 0], "quats_own": own if edited else None}
 
 
 def arguments(inputs: dict[str, Tensor | None]) -> tuple:
@@ -116,7 +116,7 @@ def test_values_and_gradients(n, corrected, shaded, extras, edited, device, fini
             torch.testing.assert_close(
                 found[name].cpu().double(), expected[name], rtol=1e-4, atol=2e-5, msg=lambda m, at=name: f"{at}: {m}"
             )
-    for name in ("quats_t", "rest means", "quats", "own"):
+    for name in ("quats_t", "rest means", "quats", "quats_own"):
         assert found[f"gradient of {name}"] is None, "training must not turn surfaces"
 
 

@@ -190,7 +190,7 @@ def test_what_does_not_fit_is_refused(device):
         ("pose.translations must be", (rest, torch.zeros(9, 3, device=device), pose, indices, weights)),
         ("weights must be", (rest, nodes, pose, indices, weights[:, :2])),
         ("not both", (rest, nodes, both, indices, weights)),
-        ("own must be", (rest, nodes, pose, indices, weights, rest[1][:5])),
+        ("quats_own must be", (rest, nodes, pose, indices, weights, rest[1][:5])),
     ]
     for number, name in ((2, "log_scales"), (3, "opacity_logits"), (4, "sh_dc"), (5, "correctives"), (6, "shading")):
         short = [x[:-1] if i == number else x for i, x in enumerate(rest)]
