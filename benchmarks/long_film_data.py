@@ -15,8 +15,9 @@ from scgs_warp.data.synthetic.figure_motion import BONES, joint_angles
 from scgs_warp.data.synthetic.joints import pose_joints
 from scgs_warp.data.synthetic.orbit_cameras import PlannedPicture, instants, surrounding
 from scgs_warp.data.synthetic.raycast import Raycaster
-from scgs_warp.data.synthetic.renderer import Optics, write_folder_atomically, write_pictures
+from scgs_warp.data.synthetic.renderer import Optics, write_pictures
 from scgs_warp.data.synthetic.surface import RigidParts
+from scgs_warp.storage.output_folders import write_folder_atomically
 
 ACTS = 4
 """Number of times that a joint of the long film goes through its motion of the short one, forth or back."""

@@ -82,6 +82,11 @@ class Pose:
     """[M, 3] change of the logarithms of the Gaussians' colours. None: no change. A pose has ``log_scales`` or
     ``tints``, not both, because skinning blends three values beside the motion."""
 
+    @property
+    def turns_of_shapes(self) -> Tensor:
+        """[M, 4] wxyz rotations of the Gaussians' shapes."""
+        return self.rotations if self.shape_rotations is None else self.shape_rotations
+
 
 @dataclass(frozen=True)
 class Gaussians:

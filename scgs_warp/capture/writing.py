@@ -12,7 +12,7 @@ import numpy as np
 
 from ..data.held_out import held_out
 from ..data.points import write_points
-from ..data.readers.transforms import OPENGL_TO_OPENCV
+from ..geometry.rotation import OPENGL_TO_OPENCV
 from ..storage.files import write_atomically
 from ..visualization.video import write_png
 from .colmap import quiet

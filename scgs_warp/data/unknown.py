@@ -10,7 +10,7 @@ from pathlib import Path
 from ..errors import UserError, shell_words
 from ..storage.files import open_regular
 from .images import INSPECTED
-from .readers.transforms import SUFFIXES as IMAGES
+from .readers.transforms import IMAGE_SUFFIXES
 
 FILMS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".mts", ".m2ts", ".3gp", ".wmv")
 VIDEOS = (*FILMS, ".gif")
@@ -73,7 +73,7 @@ def not_a_folder(path: Path) -> UserError:
         )
     if suffix == ".json" or path.name == "poses_bounds.npy":
         return UserError(f"{path}: is a file of a data set; give its folder: --data {shell_words(path.parent)}")
-    if suffix in IMAGES:
+    if suffix in IMAGE_SUFFIXES:
         return UserError(f"{path}: is one image; give the folder of a data set (docs/data.md lists the layouts)")
     return UserError(f"{path}: is a file; give the folder of a data set (docs/data.md lists the layouts)")
 
@@ -110,7 +110,7 @@ def no_layout(folder: Path, recognised: Callable[[Path], bool]) -> UserError:
     renamed = next((entry for entry in entries if entry.match("transform*.json") and entry.is_file()), None)
     if renamed is not None:
         return UserError(f"{renamed}: is read under another name; call it transforms.json if it lists frames and poses")
-    if sum(entry.suffix.lower() in IMAGES for entry in entries) >= FEWEST_PHOTOS:
+    if sum(entry.suffix.lower() in IMAGE_SUFFIXES for entry in entries) >= FEWEST_PHOTOS:
         return UserError(
             f"{folder}: holds images without cameras; find them with: scgs-warp capture {shell_words(folder)} --output "
             f"{shell_words(f'data/{folder.resolve().name}-cameras')}"

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from ..data.dataset import Dataset
-from ..data.readers.transforms import OPENGL_TO_OPENCV
 from ..evaluation.evaluate import distinct_names
+from ..geometry.rotation import OPENGL_TO_OPENCV
 from ..storage.files import write_atomically
 from ..types import Camera
 

@@ -63,7 +63,7 @@ def write_graph(path: Path, skeleton: Skeleton, edges: np.ndarray, up: tuple[flo
         "material": document.append("materials", material),
     }
     mesh = document.append("meshes", {"name": "control graph", "primitives": [primitive]})
-    skin = add_skeleton(document, skeleton, up, "motion")
+    skin = add_skeleton(document, skeleton, up)
     node = {"name": "control graph", "mesh": mesh, "skin": skin}
     document.json["scenes"][0]["nodes"].insert(0, document.append("nodes", node))
     document.write(path)

@@ -43,7 +43,7 @@ def write_glb(
         for index, (joints, weights) in enumerate(influences(skeleton.indices, skeleton.weights)):
             attributes[f"JOINTS_{index}"] = document.accessor(joints, target=VERTICES)
             attributes[f"WEIGHTS_{index}"] = document.accessor(weights, target=VERTICES)
-        node["skin"] = add_skeleton(document, skeleton, up, "motion")
+        node["skin"] = add_skeleton(document, skeleton, up)
     primitive = {"attributes": attributes, "mode": 0, "extensions": {EXTENSION: RENDERING}}
     node["mesh"] = document.append("meshes", {"name": "Gaussians", "primitives": [primitive]})
     document.json["scenes"][0]["nodes"].insert(0, document.append("nodes", node))

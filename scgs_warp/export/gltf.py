@@ -133,7 +133,7 @@ def xyzw(quats: np.ndarray) -> np.ndarray:
 
 
 def add_skeleton(
-    document: GltfDocument, skeleton: Skeleton, up: tuple[float, float, float], name: str, frame: int | None = None
+    document: GltfDocument, skeleton: Skeleton, up: tuple[float, float, float], frame: int | None = None
 ) -> int:
     """Append joints under one root, their animation, and the skin that binds vertices. Joints without names are called
     ``node_0000`` and so on.
@@ -175,7 +175,7 @@ def add_skeleton(
             for joint, track in zip(joints, tracks):
                 channels.append({"sampler": len(samplers), "target": {"node": joint, "path": path}})
                 samplers.append({"input": when, "output": track, "interpolation": "LINEAR"})
-        document.append("animations", {"name": name, "samplers": samplers, "channels": channels})
+        document.append("animations", {"name": "motion", "samplers": samplers, "channels": channels})
     return document.append("skins", skin)
 
 

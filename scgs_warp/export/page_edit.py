@@ -102,16 +102,11 @@ def edited_pose(session: EditSession, time: float, at: float | None, *, live: bo
     found = {
         "translation": to_array(pose.translations),
         "rotation": to_array(pose.rotations),
-        "own": _turns(pose if own is None else own),
+        "own": to_array((pose if own is None else own).turns_of_shapes),
         "turn": still if bent is None else bent.color_turns,
     }
     others = {"shape": pose.shape_rotations, "log_scale": pose.log_scales, "tint": pose.tints}
     return {**found, **{name: to_array(value) for name, value in others.items() if value is not None}}
-
-
-def _turns(pose: Pose) -> np.ndarray:
-    """Return the rotations of the Gaussians' shapes, [M, 4]."""
-    return to_array(pose.rotations if pose.shape_rotations is None else pose.shape_rotations)
 
 
 def camera_path(session: EditSession, moments: Sequence[float]) -> list[list[float]]:

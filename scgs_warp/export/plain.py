@@ -111,7 +111,7 @@ def _view(scene: Scene, index: int) -> _View:
     overview = scene.overview
     size = min(round(overview.longer_side) or USUAL_SIZE, LARGEST_SIZE)
     time = (0.5 + SILVER * index) % 1.0
-    camera = orbit_camera(overview, azimuth_of(overview, index), size, overview.elevation + ELEVATIONS[index % 3])
+    camera = orbit_camera(overview, view_azimuth(overview, index), size, overview.elevation + ELEVATIONS[index % 3])
     view = scene.normalisation.apply_camera(camera).to(scene.device)
     background = torch.tensor(scene.background_color, device=scene.device)
     with torch.no_grad():
@@ -120,7 +120,7 @@ def _view(scene: Scene, index: int) -> _View:
     return _View(view, time, truth)
 
 
-def azimuth_of(overview: Overview, index: int) -> float:
+def view_azimuth(overview: Overview, index: int) -> float:
     """Return the azimuth of a view in degrees; over all views they fill the orbit, or the observed arc, evenly."""
     share = (GOLDEN * index) % 1.0
     if overview.sweep >= 360.0:

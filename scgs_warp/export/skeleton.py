@@ -182,7 +182,7 @@ def build_skeleton(
         None if poses[0].tints is None else _stack([_require(pose.tints) for pose in poses]),
         indices,
         weights,
-        None if all(a is b for a, b in zip(own, poses)) else _unit([_turns(pose) for pose in own]),
+        None if all(a is b for a, b in zip(own, poses)) else _unit([pose.turns_of_shapes for pose in own]),
     )
     _check_finite(skeleton)
     return _with_rest(skeleton, scene.gaussians) if masked else skeleton
@@ -204,11 +204,6 @@ def _not_finite(time: float) -> UserError:
         f"the control points' motion is not finite at time {time:g}; train again with a lower rate, or put the "
         "previous checkpoint back"
     )
-
-
-def _turns(pose: Pose) -> Tensor:
-    """Return the rotations of the Gaussians' shapes."""
-    return pose.rotations if pose.shape_rotations is None else pose.shape_rotations
 
 
 def _pose(session: EditSession, moment: AnimationMoment, masked: bool) -> tuple[Pose, Pose | None]:

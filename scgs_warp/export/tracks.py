@@ -23,14 +23,13 @@ from ..scene.scene import Scene
 from ..storage.files import read_bytes, write_atomically
 from .gltf import VERTICES, GltfDocument, linear_colors, upright
 from .no_surface import NoSurface
+from .request import MAX_POINTS
 from .skeleton import AnimationMoment, finite_rows, posed_gaussians
 
 FORMAT = "scgs-warp tracks"
 VERSION = 1
-SUFFIXES = (".npz", ".csv", ".glb")
 MIN_OPACITY = 0.5
 """Opacity below which a Gaussian is not on the surface."""
-MAX_POINTS = 1_000_000
 MAX_BYTES = 2**27
 """Largest file of points, in bytes."""
 POINT_BYTES = {".npz": 56, ".csv": 160, ".glb": 64}

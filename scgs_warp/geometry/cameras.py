@@ -286,13 +286,6 @@ def orbit_camera(
     return Camera(look_at(eye, centre, up), K, width, height)
 
 
-def azimuth_of(overview: Overview, eye: Vector) -> float:
-    """Return the azimuth, 0 to 360 degrees, at which ``orbit_camera`` looks from the side of ``eye`` [3]."""
-    zero, ninety = _horizon(np.array(overview.up))
-    offset = _vector("eye", eye) - np.array(overview.centre)
-    return math.degrees(math.atan2(float(offset @ ninety), float(offset @ zero))) % 360.0
-
-
 def turntable(
     overview: Overview, frames: int, size: int, azimuths: tuple[float, float] | None = None, step: int = 2
 ) -> list[Camera]:

@@ -1,4 +1,4 @@
-"""Rotations outside the kernels: quaternions (wxyz) in torch, and a check of matrices read from files."""
+"""Rotations outside the kernels: quaternions (wxyz) in torch, and matrices of cameras in files."""
 
 from __future__ import annotations
 
@@ -6,6 +6,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
+"""[4, 4] from axes of a camera in OpenGL (x right, y up, z backward) to OpenCV (x right, y down, z forward), and
+back."""
 RIGID_TOLERANCE = 1e-3
 """Largest magnitude of an entry of ``R^T R - I`` that counts as rounding."""
 

@@ -6,7 +6,8 @@ import errno
 import os
 import re
 import shutil
-from collections.abc import Iterable
+import tempfile
+from collections.abc import Callable, Iterable
 from contextlib import suppress
 from pathlib import Path
 
@@ -86,6 +87,31 @@ def check_replaceable(path: Path, pattern: str, held: str) -> Path:
     if folder.is_dir() and not holds_only(folder, pattern):
         raise UserError(f"{path}: holds other files than {held}; name a new folder")
     return folder
+
+
+def write_folder_atomically(folder: Path, write: Callable[[Path], None]) -> None:
+    """Let ``write`` fill a temporary folder next to ``folder``, then rename it, so that an incomplete folder never
+    remains. A link stays one: the folder that it leads to is written.
+
+    Raises:
+        UserError: the folder cannot be written, or is the current one or contains it.
+    """
+    folder = Path(os.path.realpath(folder))
+    if Path.cwd().is_relative_to(folder):
+        raise UserError(f"{folder}: is the current folder or contains it; name a new folder")
+    try:
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        work = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
+    except OSError as error:
+        raise UserError(f"{folder}: cannot be made ({error.strerror}); choose a folder that can be written") from None
+    try:
+        write(work)
+        os.chmod(work, 0o755)  # mkdtemp makes private folders.
+        replace_folder(folder, work)
+    except OSError as error:
+        raise UserError(f"{folder}: cannot be written ({error.strerror}); make room or choose another folder") from None
+    finally:
+        shutil.rmtree(work, ignore_errors=True)
 
 
 def replace_folder(path: Path, new: Path) -> None:

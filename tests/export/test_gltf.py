@@ -50,7 +50,7 @@ def test_vertices_at_rest_stay_where_they_are():
     binding = np.array([[0], [1]]), np.ones((2, 1))
     skeleton = Skeleton(times, times, rest, positions, still, None, None, None, *binding)
     document = GltfDocument()
-    index = add_skeleton(document, skeleton, (0.0, 1.0, 0.0), "motion")
+    index = add_skeleton(document, skeleton, (0.0, 1.0, 0.0))
     skin = document.json["skins"][index]
     accessor = document.json["accessors"][skin["inverseBindMatrices"]]
     view = document.json["bufferViews"][accessor["bufferView"]]

@@ -83,11 +83,11 @@ def test_gaussians_that_are_broken_or_out_of_sight_get_the_formula():
 
 def test_views_cover_the_orbit_or_the_arc():
     ring = Overview((0.0, 0.0, 0.0), (0.0, 0.0, 1.0), 4.0, 40.0, 10.0, azimuth=30.0)
-    found = sorted(plain.azimuth_of(ring, index) % 360.0 for index in range(plain.VIEWS))
+    found = sorted(plain.view_azimuth(ring, index) % 360.0 for index in range(plain.VIEWS))
     gaps = np.diff([*found, found[0] + 360.0])
     assert gaps.max() < 2.0 * 360.0 / plain.VIEWS
     arc = dataclasses.replace(ring, sweep=50.0)
-    found = [plain.azimuth_of(arc, index) for index in range(plain.VIEWS)]
+    found = [plain.view_azimuth(arc, index) for index in range(plain.VIEWS)]
     assert min(found) >= 10.0 and max(found) <= 50.0 and max(found) - min(found) > 35.0
 
 

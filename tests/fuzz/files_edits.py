@@ -15,7 +15,7 @@ from fuzz.files_cases import Format, check_gaussians, check_numbers, expect, fin
 from helpers.edit_scenes import bar_scene
 from scgs_warp.capture import CaptureRequest, picked_frames, pipeline
 from scgs_warp.capture.journal import Journal
-from scgs_warp.capture.rig.instants import frame_seconds
+from scgs_warp.capture.rig.instants import recorded
 from scgs_warp.capture.rig.sound import MAX_SECONDS as MAX_SOUND
 from scgs_warp.capture.rig.sound import RATE, read_sound
 from scgs_warp.capture.rig.synchronisation import synchronise
@@ -206,7 +206,7 @@ def write_sounding(folder: Path) -> None:
 
 def load_sounding(folder: Path) -> None:
     """Read sound and moments as ``apps/capture.py --rig`` does."""
-    seconds = frame_seconds(folder / "cam0.mp4")
+    seconds = recorded(folder / "cam0.mp4").seconds
     finite("moments", seconds)
     expect(seconds.ndim == 1 and len(seconds) > 0 and bool((np.diff(seconds) >= 0).all()), "moments ascend")
     sound = read_sound(folder / "cam0.mp4")

@@ -158,7 +158,7 @@ def test_orbit_cameras_stand_on_the_sphere_at_their_elevation(elevation, height)
     offset = camera.position.double() - torch.tensor(overview.centre)
     assert float(offset.norm()) == pytest.approx(5.0, rel=1e-5)
     assert float(offset[2]) == pytest.approx(5.0 * height, abs=1e-5)
-    assert cameras.azimuth_of(overview, camera.position) == pytest.approx(75.0, abs=1e-3)
+    assert math.degrees(math.atan2(offset[1], offset[0])) == pytest.approx(75.0, abs=1e-3)
 
 
 def test_orbit_cameras_keep_off_the_poles() -> None:
@@ -168,4 +168,4 @@ def test_orbit_cameras_keep_off_the_poles() -> None:
         for sign in (1.0, -1.0):
             eye = cameras.orbit_camera(overview, 75.0, 300, sign * elevation).position
             assert float(eye[2]) == pytest.approx(sign * 5.0 * math.sin(math.radians(cameras.STEEPEST)), rel=1e-6)
-            assert cameras.azimuth_of(overview, eye) == pytest.approx(75.0, abs=0.01)
+            assert math.degrees(math.atan2(eye[1], eye[0])) == pytest.approx(75.0, abs=0.01)

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from ...errors import UserError
-from ...geometry.rotation import is_rotation
+from ...geometry.rotation import OPENGL_TO_OPENCV, is_rotation
 
 MAX_NUMBER = 1e9
 """Largest magnitude of a number in a pose or an intrinsic, and largest depth."""
@@ -22,7 +22,6 @@ NEAR_ROTATION = 0.02
 
 Y_UP_TO_Z_UP = np.array([[0.0, 0.0, 1.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
 """World of ARKit (y up) to ours (z up)."""
-OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 @dataclass(frozen=True)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 import shutil
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -134,10 +134,6 @@ def solution_of(model: Any, names: Sequence[str]) -> RigSolution:
     )
 
 
-Triangulated = tuple[np.ndarray, np.ndarray]
-"""Points [P, 3] and colours [P, 3] uint8."""
-
-
 def centre_of(viewmat: np.ndarray) -> np.ndarray:
     """Return the position [3] of a camera."""
     return -viewmat[:3, :3].T @ viewmat[:3, 3]
@@ -146,6 +142,3 @@ def centre_of(viewmat: np.ndarray) -> np.ndarray:
 def pairs_of(count: int) -> list[tuple[int, int]]:
     """Return all pairs of cameras."""
     return [(a, b) for a in range(count) for b in range(a + 1, count)]
-
-
-Advance = Callable[[], object]

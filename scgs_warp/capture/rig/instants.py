@@ -62,11 +62,6 @@ class Recorded(NamedTuple):
     """What is there of an incomplete video."""
 
 
-def frame_seconds(path: Path) -> np.ndarray:
-    """Return the moments [V] of a video's frames in seconds; see :func:`recorded`."""
-    return recorded(path).seconds
-
-
 def recorded(path: Path) -> Recorded:
     """Read the moments of a video's frames; at most the first picture is decoded.
 

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from ...data.points import write_points
-from ...data.readers.transforms import OPENGL_TO_OPENCV
+from ...geometry.rotation import OPENGL_TO_OPENCV
 from ...visualization.video import write_png
 from .. import pictures
 from ..similarity import upright

@@ -11,7 +11,7 @@ from typing import NamedTuple
 from ...errors import UserError
 from ...storage.safe_paths import inside
 from ..moved_images import find_move
-from .transforms import SUFFIXES
+from .transforms import IMAGE_SUFFIXES
 
 REDUCED = re.compile(r"images_([1-9][0-9]{0,2})(_png)?")
 """Names of the folders of reduced images, as LLFF and Mip-NeRF 360 call them."""
@@ -110,7 +110,7 @@ def _named(
 def _listing(folder: Path) -> dict[str, str]:
     """Return the names of a folder's images by their names in lower case, with and without suffix."""
     try:
-        names = sorted(name for name in os.listdir(folder) if name.lower().endswith(SUFFIXES))
+        names = sorted(name for name in os.listdir(folder) if name.lower().endswith(IMAGE_SUFFIXES))
     except OSError:
         return {}
     listing: dict[str, str] = {}
@@ -123,7 +123,9 @@ def _listing(folder: Path) -> dict[str, str]:
 def _in_order(folder: Path, names: Sequence[str]) -> list[Path]:
     """Return the files of a folder in the order of the names, which LLFF's reduced images (``image000.png``) keep; an
     empty list if there are more of them, or fewer."""
-    files = sorted(folder / name for name in os.listdir(folder) if name.lower().endswith(SUFFIXES) and name[0] != ".")
+    files = sorted(
+        folder / name for name in os.listdir(folder) if name.lower().endswith(IMAGE_SUFFIXES) and name[0] != "."
+    )
     if len(files) != len(names):
         return []
     ordered = sorted(range(len(names)), key=lambda index: names[index])

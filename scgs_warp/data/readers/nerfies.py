@@ -33,7 +33,7 @@ from ..held_out import held_out
 from ..images import ReadOptions, size_text
 from ..lens import Lens, make_lens
 from . import dycheck
-from .transforms import SUFFIXES
+from .transforms import IMAGE_SUFFIXES
 
 FILE = "dataset.json"
 
@@ -176,7 +176,7 @@ def _of_split(listing: Listing, chosen: list[str], split: str, chosen_cameras: b
 
 def _image(folder: Path, name: str) -> Path:
     """Return the image of an id."""
-    candidates = [folder / f"{name}{suffix}" for suffix in SUFFIXES]
+    candidates = [folder / f"{name}{suffix}" for suffix in IMAGE_SUFFIXES]
     return first_there(candidates) or candidates[0]
 
 

@@ -30,7 +30,7 @@ from ..natural_order import by_name, natural
 from ..points import read_points
 from .colmap_images import reduced_folders
 from .colmap_model import find_model
-from .transforms import SUFFIXES
+from .transforms import IMAGE_SUFFIXES
 
 FILE = "poses_bounds.npy"
 VIDEOS = (".mp4", ".mov", ".avi", ".mkv")
@@ -49,7 +49,7 @@ def recognises(folder: Path) -> bool:
     if not (folder / FILE).is_file():
         return False
     single = [path for path in (folder / "images", *reduced_folders(folder)) if path.is_dir()]
-    alone = any(file.suffix.lower() in SUFFIXES for path in single for file in path.iterdir() if file.is_file())
+    alone = any(file.suffix.lower() in IMAGE_SUFFIXES for path in single for file in path.iterdir() if file.is_file())
     return not (alone and find_model(folder) is not None)
 
 
@@ -223,7 +223,7 @@ def _is_shown(path: Path) -> bool:
 
 
 def _files(folder: Path) -> list[Path]:
-    files = [p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES and _is_shown(p)]
+    files = [p for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES and _is_shown(p)]
     return sorted(files, key=lambda p: natural(p.name))
 
 

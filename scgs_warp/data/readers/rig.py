@@ -16,7 +16,7 @@ from ..images import ReadOptions, is_reduced, size_text
 from ..lens import Lens, make_lens, rescaled
 from ..name_times import times_from_names
 from ..natural_order import natural
-from .transforms import SUFFIXES
+from .transforms import IMAGE_SUFFIXES
 
 OFF_CENTRE = 0.8
 """Shares of width and height beyond which a principal point is that of larger images."""
@@ -94,7 +94,9 @@ def images_in(folder: Path) -> dict[str, Path]:
     """Return the images in a folder by their names without suffix; none if there is no such folder."""
     if not folder.is_dir():
         return {}
-    files = (file for file in folder.iterdir() if file.suffix.lower() in SUFFIXES and not file.name.startswith("."))
+    files = (
+        file for file in folder.iterdir() if file.suffix.lower() in IMAGE_SUFFIXES and not file.name.startswith(".")
+    )
     return {file.stem: file for file in files}
 
 

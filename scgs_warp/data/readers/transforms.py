@@ -12,15 +12,14 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ...errors import UserError
-from ...geometry.rotation import RIGID_TOLERANCE, is_rotation
+from ...geometry.rotation import OPENGL_TO_OPENCV, RIGID_TOLERANCE, is_rotation
 from ...storage.json_files import as_number, numbers, read_json
 from ...storage.safe_paths import inside
 from ..images import header_sizes, is_reduced, size_text
 from ..lens import BROWN4, Lens, make_lens, rescaled
 from ..natural_order import by_name
 
-OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0, 1.0])
-SUFFIXES = (".png", ".jpg", ".jpeg", ".webp")
+IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".webp")
 DISTORTION = ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2")
 LISTED_DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
 """Names of the parameters in ``distortion_params``, in nerfstudio's order."""

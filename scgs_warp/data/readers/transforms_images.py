@@ -10,7 +10,7 @@ from ...errors import UserError
 from ...storage.safe_paths import first_there, inside
 from ..moved_images import Move, find_move, parts_of
 from .colmap_images import reduced_folders
-from .transforms import SUFFIXES
+from .transforms import IMAGE_SUFFIXES
 
 
 class FrameFiles(NamedTuple):
@@ -83,10 +83,10 @@ def _existing(folder: Path, name: str) -> Path | None:
 
 
 def _completed(base: Path) -> Path:
-    if base.suffix.lower() in SUFFIXES:
-        candidates = [base, *(base.with_suffix(suffix) for suffix in SUFFIXES)]
+    if base.suffix.lower() in IMAGE_SUFFIXES:
+        candidates = [base, *(base.with_suffix(suffix) for suffix in IMAGE_SUFFIXES)]
     else:
-        candidates = [base.with_name(base.name + suffix) for suffix in SUFFIXES]
+        candidates = [base.with_name(base.name + suffix) for suffix in IMAGE_SUFFIXES]
     return base if base.is_file() else first_there(candidates) or candidates[0]
 
 
@@ -96,7 +96,7 @@ def _other_suffixes(path: Path, names: list[str], files: list[Path]) -> tuple[st
     other = [
         f"{file.name} for {name.name}"
         for name, file in pairs
-        if name.suffix.lower() in SUFFIXES and name.suffix.lower() != file.suffix.lower()
+        if name.suffix.lower() in IMAGE_SUFFIXES and name.suffix.lower() != file.suffix.lower()
     ]
     return (f"{path}: images of other names than listed are used, such as {other[0]}",) if other else ()
 

@@ -20,12 +20,12 @@ import numpy as np
 from ...errors import UserError
 from ...storage.files import read_text
 from ...storage.json_files import parse_json
-from ...storage.output_folders import paths_in
+from ...storage.output_folders import paths_in, write_folder_atomically
 from .figure import build_figure
 from .figure_motion import bone_transforms
 from .orbit_cameras import PlannedPicture, instants, random_on_sphere, surrounding
 from .raycast import Raycaster
-from .renderer import SURFACE_POINTS, Optics, pick_on_triangles, write_folder_atomically, write_pictures
+from .renderer import SURFACE_POINTS, Optics, pick_on_triangles, write_pictures
 from .shading import Shading
 from .surface import PartMesh, RigidParts
 

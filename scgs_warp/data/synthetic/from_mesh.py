@@ -16,13 +16,13 @@ import numpy as np
 from ...errors import UserError
 from ...storage.files import read_text
 from ...storage.json_files import parse_json
-from ...storage.output_folders import paths_in
+from ...storage.output_folders import paths_in, write_folder_atomically
 from ..dataset import spread
 from ..gltf.scene import GltfScene, read_scene
 from .contact_sheet import ContactSheet
 from .mesh import MeshSubject
 from .orbit_cameras import FilmingSettings, PlannedPicture, camera_of, plan_pictures
-from .renderer import SURFACE_POINTS, Background, Optics, Subject, write_folder_atomically, write_pictures, write_png
+from .renderer import SURFACE_POINTS, Background, Optics, Subject, write_pictures, write_png
 from .shading import Shading
 from .zoo import SUBJECTS
 from .zoo import VERSION as ZOO_VERSION

@@ -7,9 +7,6 @@ lets the subject render the planned pictures, and writes the folder that a reade
 from __future__ import annotations
 
 import json
-import os
-import shutil
-import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,7 +17,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ...errors import UserError
 from ...types import Camera
 from .orbit_cameras import PlannedPicture, camera_of
 
@@ -207,38 +203,3 @@ def subject_height(subject: Subject) -> float:
     vertices = subject.pose(0.0).vertices.cpu().numpy()
     extent = vertices.max(0) - vertices.min(0)
     return extent[2] if extent[2] > 0.05 * extent.max() else extent.max()
-
-
-def write_folder_atomically(folder: Path, write: Callable[[Path], None]) -> None:
-    """Let ``write`` fill a temporary folder next to ``folder``, then rename it, so that an incomplete folder never
-    remains. A link stays one: the folder that it leads to is written.
-
-    Raises:
-        UserError: the folder cannot be written, or is the current one or contains it.
-    """
-    folder = Path(os.path.realpath(folder))
-    if Path.cwd().is_relative_to(folder):
-        raise UserError(f"{folder}: is the current folder or contains it; name a new folder")
-    try:
-        folder.parent.mkdir(parents=True, exist_ok=True)
-        work = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
-    except OSError as error:
-        raise UserError(f"{folder}: cannot be made ({error.strerror}); choose a folder that can be written") from None
-    try:
-        write(work)
-        os.chmod(work, 0o755)  # mkdtemp makes private folders.
-        _replace(folder, work)
-    except OSError as error:
-        raise UserError(f"{folder}: cannot be written ({error.strerror}); make room or choose another folder") from None
-    finally:
-        shutil.rmtree(work, ignore_errors=True)
-
-
-def _replace(folder: Path, work: Path) -> None:
-    if folder.exists():
-        old = Path(tempfile.mkdtemp(prefix=f".{folder.name}-old-", dir=folder.parent))
-        os.rename(folder, old / "scene")
-        os.rename(work, folder)
-        shutil.rmtree(old, ignore_errors=True)
-    else:
-        os.rename(work, folder)

@@ -87,7 +87,7 @@ def _document(
         for index, (joints, weights) in enumerate(influences(skeleton.indices, skeleton.weights)):
             attributes[f"JOINTS_{index}"] = document.accessor(joints, target=VERTICES)
             attributes[f"WEIGHTS_{index}"] = document.accessor(weights, target=VERTICES)
-        node["skin"] = add_skeleton(document, skeleton, up, "motion", frame)
+        node["skin"] = add_skeleton(document, skeleton, up, frame)
     material = {
         "name": "surface",
         "doubleSided": not closed,

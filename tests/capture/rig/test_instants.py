@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from helpers.films import cut_film, encoded, pan, without_beginning
-from scgs_warp.capture.rig.instants import frame_seconds, time_line
+from scgs_warp.capture.rig.instants import recorded, time_line
 from scgs_warp.capture.source import Video
 from scgs_warp.data.synthetic.films.encoding import write_film
 from scgs_warp.errors import UserError
@@ -38,7 +38,7 @@ def test_frames_before_a_cut_do_not_count(tmp_path):
     write_film(tmp_path / "whole.mp4", pan(range(60)), 30.0, 20, None)
     cut_film(tmp_path / "whole.mp4", tmp_path / "cut.mp4", 10)
     shown = list(Video(tmp_path / "cut.mp4").frames(64))
-    assert len(shown) == 50 and len(frame_seconds(tmp_path / "cut.mp4")) == len(shown)
+    assert len(shown) == 50 and len(recorded(tmp_path / "cut.mp4").seconds) == len(shown)
 
 
 @pytest.mark.parametrize("kind", ["mp4", "mkv", "ts"])
@@ -47,7 +47,7 @@ def test_frames_before_the_first_key_frame_do_not_count(tmp_path, kind):
     encoded(tmp_path / f"whole.{kind}", 60, gop=20)
     without_beginning(tmp_path / f"whole.{kind}", tmp_path / f"cut.{kind}", 7)
     shown = list(Video(tmp_path / f"cut.{kind}").frames(64))
-    found = frame_seconds(tmp_path / f"cut.{kind}")
+    found = recorded(tmp_path / f"cut.{kind}").seconds
     np.testing.assert_allclose(found, [still.seconds for still in shown], atol=1e-6)
     assert len(shown) == 40
 
@@ -81,7 +81,7 @@ def test_no_time_in_common_is_said():
 
 def test_moments_are_those_of_the_frames_of_a_film(tmp_path):
     write_film(tmp_path / "film.mp4", [np.full((64, 64, 3), k * 8, np.uint8) for k in range(20)], 12.5, 20, None)
-    np.testing.assert_allclose(frame_seconds(tmp_path / "film.mp4"), np.arange(20) / 12.5, atol=1e-6)
+    np.testing.assert_allclose(recorded(tmp_path / "film.mp4").seconds, np.arange(20) / 12.5, atol=1e-6)
     (tmp_path / "text.mp4").write_text("no film")
     with pytest.raises(UserError, match="not a video"):
-        frame_seconds(tmp_path / "text.mp4")
+        recorded(tmp_path / "text.mp4")

@@ -18,8 +18,8 @@ import numpy as np
 from ....errors import UserError
 from ....storage.files import read_text
 from ....storage.json_files import parse_json
-from ....storage.output_folders import paths_in
-from ..renderer import SURFACE_POINTS, write_folder_atomically
+from ....storage.output_folders import paths_in, write_folder_atomically
+from ..renderer import SURFACE_POINTS
 from .request import FilmRequest, check
 from .shooting import Shooting
 from .stage import Stage, stage_of
