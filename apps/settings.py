@@ -90,8 +90,8 @@ def configuration(
     options: Settings,
     file: Path | None,
     flags: dict[str, Any],
-    usual: PresetName | None = None,
-    usual_batch: int = 1,
+    default_preset: PresetName | None = None,
+    default_batch: int = 1,
     resumed: bool = False,
 ) -> tuple[TrainConfig, str | None]:
     """Build the complete configuration, and return it with the data folder that ``file`` names.
@@ -99,9 +99,9 @@ def configuration(
     Args:
         file: A config.json or a part of one, which options override, or None.
         flags: Fields that the app's own options set, by their dotted names; None leaves a field unset.
-        usual: Preset if neither the options nor ``file`` name one; None stands for cpu if ``file`` names a data folder,
-            otherwise quick.
-        usual_batch: Views per step if neither the options nor ``file`` set them.
+        default_preset: Preset if neither the options nor ``file`` name one; None stands for cpu if ``file`` names a
+            data folder, otherwise quick.
+        default_batch: Views per step if neither the options nor ``file`` set them.
         resumed: whether ``file`` is that of a run that continues: ``--steps`` then moves its end alone.
 
     Raises:
@@ -116,8 +116,8 @@ def configuration(
         if values.get("preset", options.preset) != options.preset:
             raise UserError(f"{file}: is of preset {values['preset']}; leave out --preset {options.preset}")
         values["preset"] = options.preset
-    values.setdefault("batch", usual_batch)
-    values.setdefault("preset", usual or ("cpu" if folder else "quick"))
+    values.setdefault("batch", default_batch)
+    values.setdefault("preset", default_preset or ("cpu" if folder else "quick"))
     # A complete file states its milestones; those of a partial one that names the steps are scaled.
     steps = values.pop("steps", None) if "pretrain" not in values else None
     made = presets.from_dict(values, str(file or "options"))

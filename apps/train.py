@@ -110,12 +110,14 @@ def main(args: list[str] | None) -> None:
     where = process_rank()
     threads = where.threads if where and options.threads is None else options.threads
     device = prepare(options.device, threads, options.memory_gib)
-    usual = "cpu" if options.data else None
-    recorded = (options.output or default_output(options.data, options.preset or usual or "quick")) / "config.json"
+    default_preset = "cpu" if options.data else None
+    recorded = (
+        options.output or default_output(options.data, options.preset or default_preset or "quick")
+    ) / "config.json"
     resumed = options.resume and options.config is None and recorded.is_file()
     file = recorded if resumed else options.config
     flags = {"motion.model": options.motion, "seed": options.seed}
-    config, named = configuration(options, file, flags, usual, where.size if where else 1, resumed)
+    config, named = configuration(options, file, flags, default_preset, where.size if where else 1, resumed)
     folder = options.data or (Path(named) if named else None)
     output = options.output or (recorded.parent if resumed else default_output(folder, config.preset))
 
@@ -139,10 +141,18 @@ def main(args: list[str] | None) -> None:
     with join_processes(where, device) as group:
         if folder is None:  # Only one of several processes makes it.
             folder = group.in_turn(lambda: builtin_scene(device)) if group else builtin_scene(device)
-        rest = {"device": device, "resume": options.resume, "tensorboard": options.tensorboard, "group": group}
-        rest["watcher"] = watcher
-        command = command_line("apps/train.py", sys.argv[1:] if args is None else args)
-        metrics = train_and_evaluate(config, folder, output, before_training=show_advice, command=command, **rest)
+        metrics = train_and_evaluate(
+            config,
+            folder,
+            output,
+            device=device,
+            resume=options.resume,
+            before_training=show_advice,
+            tensorboard=options.tensorboard,
+            group=group,
+            command=command_line("apps/train.py", sys.argv[1:] if args is None else args),
+            watcher=watcher,
+        )
         say(summary(metrics))
         if group:
             say(group.summary())

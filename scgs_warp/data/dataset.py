@@ -215,3 +215,19 @@ class Dataset(Sequence[Frame]):
         factor of 1.1)."""
         centres = torch.stack([camera.position.double().cpu() for camera in self.cameras])
         return float((centres - centres.mean(0)).norm(dim=1).max())
+
+
+def neighbors_in_time(data: Dataset) -> Tensor:
+    """Return [V, 2] indices of the frames before and after each frame, among those of the same camera if the cameras
+    stand still."""
+    poses = [tuple(camera.viewmat.flatten().tolist()) for camera in data.cameras]
+    still = len(set(poses)) <= len(poses) // 2
+    groups: dict[object, list[int]] = {}
+    for index in sorted(range(len(poses)), key=lambda index: float(data.times[index])):
+        groups.setdefault(poses[index] if still else None, []).append(index)
+    neighbors = torch.zeros(len(poses), 2, dtype=torch.long)
+    for group in groups.values():
+        for place, index in enumerate(group):
+            neighbors[index, 0] = group[max(place - 1, 0)]
+            neighbors[index, 1] = group[min(place + 1, len(group) - 1)]
+    return neighbors

@@ -25,6 +25,7 @@ from ..kernels.cpu import sharing as kernels
 from ..kernels.types import SHARED_ARGUMENTS
 from . import addresses, environment
 from .cpu_kernel import CpuKernel
+from .kernel_arguments import FIRST_SIZE
 from .kernel_cache import prepared
 from .memory import NotEnoughMemory
 
@@ -32,8 +33,6 @@ STATE, DONE, AWAKE, ENTRY, SPINS, JOB_SIZE = 0, 8, 16, 24, 32, 33
 """Indices of a job's numbers (``kernels/native/sharing.h``), and how many there are."""
 MOST_SEATS = 255
 """Largest number of helpers that share a grid; a job has eight bits for it."""
-FIRST_SIZE = 4
-"""Size in bytes of a kernel's first argument."""
 LOOKS = 40_000
 """Number of looks in vain after which a helper sleeps: about a millisecond, more than Python takes between two kernels
 of a frame. Waking a helper costs the caller more than a short kernel takes, since both need the interpreter."""

@@ -13,10 +13,7 @@ from typing import Any
 import torch
 import warp as wp
 
-from .kernel_arguments import ArgumentPacker, warp_arguments
-
-FIRST_SIZE = ctypes.sizeof(ctypes.c_int)
-"""Number of bytes of ``first``, which precedes the other arguments."""
+from .kernel_arguments import FIRST_SIZE, ArgumentPacker, warp_arguments
 
 
 class RecordedKernel:

@@ -42,6 +42,8 @@ _SCALAR_FORMATS = {
     ctypes.c_double: "d",
     ctypes.c_bool: "?",
 }
+FIRST_SIZE = ctypes.sizeof(ctypes.c_int)
+"""Size in bytes of a kernel's first argument, the grid index ``first``."""
 LARGEST_STRIDE = 2**31 - 1
 """Largest distance in bytes between neighbouring elements along a dimension, which Warp stores as int32."""
 MAX_LAYOUTS = 256
@@ -169,7 +171,7 @@ class ArgumentPacker:
 
     def _format(self) -> str:
         """Return the format for ``struct``, with the compiler's padding written out."""
-        text, end = "=", ctypes.sizeof(ctypes.c_int)
+        text, end = "=", FIRST_SIZE
         for parameter, ctype, offset in zip(self._parameters, self._types, self.offsets[1:]):
             size = ctypes.sizeof(ctype)
             # An array's address changes with every launch; the rest of its descriptor depends on the shape only.

@@ -14,11 +14,15 @@ from .second_try_config import may_be_tried_again
 from .silhouettes import is_in_parts, is_thin
 
 
+def fewest_points(config: TrainConfig) -> int:
+    """Return the smallest number of initial points that locates the scene and that control points can be sampled from.
+    Fewer points are noise of a failed reconstruction."""
+    return max(FEWEST_POINTS, config.motion.neighbors + 1)
+
+
 def has_initial_points(data: Dataset, config: TrainConfig) -> bool:
-    """Decide whether the data has enough initial points to locate the scene and to sample control points from. Fewer
-    points are noise of a failed reconstruction."""
-    fewest = max(FEWEST_POINTS, config.motion.neighbors + 1)
-    return data.points is not None and len(data.points) >= fewest
+    """Decide whether the data has at least :func:`fewest_points`."""
+    return data.points is not None and len(data.points) >= fewest_points(config)
 
 
 def resolve_auto(config: TrainConfig, data: Dataset) -> TrainConfig:

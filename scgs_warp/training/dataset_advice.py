@@ -17,6 +17,7 @@ from ..config.presets import TrainConfig, preset
 from ..data.dataset import Dataset, spread
 from ..geometry.normalisation import FEWEST_POINTS, Normalisation
 from ..types import Frame
+from .automatic import fewest_points
 from .scene_distance import place
 from .silhouettes import is_in_parts, is_thin
 from .standing_cameras import LATE, standing_groups
@@ -231,7 +232,7 @@ def advise(facts: Survey, config: TrainConfig, device: str = "cpu") -> tuple[str
         f"{facts.arc:.0f} in all; {_content(facts)}; {points}"
     )
     compares = config.loss.depth > 0.0 and facts.depth_maps >= MOSTLY_MAPPED * facts.frames
-    return first, f"expect {_expectation(facts, compares)}; {_help(facts, config, device)}"
+    return first, f"expect {_expectation(facts, compares)}; {_suggestion(facts, config, device)}"
 
 
 def _content(facts: Survey) -> str:
@@ -287,14 +288,14 @@ def _expectation(facts: Survey, compares_depth: bool) -> str:
 def progressive_without_effect(config: TrainConfig, frames: int, points: int) -> str | None:
     """Say why progressive pre-training has no effect on data with so many ``frames`` and initial ``points``. None: it
     has an effect, or is off."""
-    pretrain, enough = config.pretrain, max(FEWEST_POINTS, config.motion.neighbors + 1)
+    pretrain = config.pretrain
     if not pretrain.progressive:
         return None
     if config.motion.model != "control-points":
         return f"--progressive has no effect with --motion {config.motion.model}, which has no stage 1"
     if pretrain.steps == 0:
         return "--progressive has no effect without stage 1: pretrain.steps is 0"
-    if points >= enough and not pretrain.with_points:  # as automatic.resolve_auto
+    if points >= fewest_points(config) and not pretrain.with_points:  # as automatic.resolve_auto
         return (
             "--progressive has no effect: the data's points take the place of stage 1; "
             "--set pretrain.with_points=true keeps that stage"
@@ -302,7 +303,7 @@ def progressive_without_effect(config: TrainConfig, frames: int, points: int) ->
     return "--progressive has no effect: there is only one frame" if frames < 2 else None
 
 
-def _help(facts: Survey, config: TrainConfig, device: str) -> str:
+def _suggestion(facts: Survey, config: TrainConfig, device: str) -> str:
     """Name the setting that improves the result most, or one that was asked for and has no effect."""
     without_effect = progressive_without_effect(config, facts.frames, facts.points)
     if without_effect is not None and not preset(config.preset).pretrain.progressive:

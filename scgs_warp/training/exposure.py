@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from ..config.presets import LossConfig
-from ..data.dataset import Dataset
+from ..data.dataset import Dataset, neighbors_in_time
 from ..optim import Adam
 
 
@@ -76,19 +76,3 @@ def exposed(picture: Tensor, alpha: Tensor, background: Tensor, color: Tensor) -
     # One product, because its gradient to the colour has the same bits on any number of threads, unlike a sum.
     rows = torch.cat([picture - behind, alpha[None]]).flatten(1)
     return (color @ rows).view_as(picture) + behind
-
-
-def neighbors_in_time(data: Dataset) -> Tensor:
-    """Return [V, 2] indices of the frames before and after each frame, among those of the same camera if the cameras
-    stand still."""
-    poses = [tuple(camera.viewmat.flatten().tolist()) for camera in data.cameras]
-    still = len(set(poses)) <= len(poses) // 2
-    groups: dict[object, list[int]] = {}
-    for index in sorted(range(len(poses)), key=lambda index: float(data.times[index])):
-        groups.setdefault(poses[index] if still else None, []).append(index)
-    neighbors = torch.zeros(len(poses), 2, dtype=torch.long)
-    for group in groups.values():
-        for place, index in enumerate(group):
-            neighbors[index, 0] = group[max(place - 1, 0)]
-            neighbors[index, 1] = group[min(place + 1, len(group) - 1)]
-    return neighbors

@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from ..config.presets import TrainConfig
-from ..data.dataset import Dataset
+from ..data.dataset import Dataset, neighbors_in_time
 from ..geometry.cameras import scaled_camera
 from ..geometry.optical_flow import at_targets, dense_flow, returns, targets_of, textured
 from ..ops.binning import bin_splats
@@ -26,7 +26,6 @@ from ..ops.compositing import composite
 from ..ops.projection import project
 from ..runtime.environment import one_piece
 from ..types import Camera, Frame, Gaussians
-from .exposure import neighbors_in_time
 
 FLOW_SIDE = 512
 """Longer side of the images between which flow is measured, at most, pixels."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,10 +12,11 @@ import torch
 
 from helpers.dycheck_files import write_dycheck
 from helpers.nerfstudio_files import write
-from helpers.tiny import tiny_dataset
+from helpers.tiny import tiny_camera, tiny_dataset
 from scgs_warp.data import load
-from scgs_warp.data.dataset import Dataset, spread
+from scgs_warp.data.dataset import Dataset, neighbors_in_time, spread
 from scgs_warp.errors import UserError
+from scgs_warp.types import Frame
 
 
 def test_a_file_that_goes_away_is_told_when_it_is_needed(tmp_path):
@@ -60,6 +62,15 @@ def test_spread_takes_no_more_than_it_may(count, most):
     assert chosen == sorted(chosen) and all(0 <= index < count for index in chosen)
     if count and most > 1:
         assert chosen[0] == 0 and chosen[-1] == count - 1
+
+
+def test_neighbours_are_those_in_time():
+    data = tiny_dataset(5)
+    assert neighbors_in_time(data).tolist() == [[0, 1], [0, 2], [1, 3], [2, 4], [3, 4]]
+    cameras = [tiny_camera(k % 2, 2, 48) for k in range(6)]
+    frames = [Frame(cameras[k], (k // 2) / 2, torch.zeros(4, 4, 3), None, None, f"{k}") for k in range(6)]
+    rig = Dataset(frames, folder=Path("rig"), split="train")
+    assert neighbors_in_time(rig).tolist() == [[0, 2], [1, 3], [0, 4], [1, 5], [2, 4], [3, 5]]
 
 
 def test_other_data_has_another_fingerprint():

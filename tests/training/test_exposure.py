@@ -16,7 +16,7 @@ from scgs_warp.evaluation.evaluate import evaluate
 from scgs_warp.rendering.render import render
 from scgs_warp.scene.frame_colors import FrameColors, apply_color, fitted_color
 from scgs_warp.storage.checkpoint import read
-from scgs_warp.training.exposure import Exposure, exposed, neighbors_in_time
+from scgs_warp.training.exposure import Exposure, exposed
 from scgs_warp.training.loop import fit
 from scgs_warp.types import Frame
 
@@ -47,15 +47,6 @@ def test_colours_change_the_subject_and_not_the_background():
             torch.testing.assert_close(shown[:, y, x], expected)
     assert torch.autograd.gradcheck(lambda *values: exposed(values[0], values[1], background, values[2]),
                                     (picture, alpha, color))  # fmt: skip
-
-
-def test_neighbours_are_those_in_time():
-    data = tiny_dataset(5)
-    assert neighbors_in_time(data).tolist() == [[0, 1], [0, 2], [1, 3], [2, 4], [3, 4]]
-    cameras = [tiny_camera(k % 2, 2, SIZE) for k in range(6)]
-    frames = [Frame(cameras[k], (k // 2) / 2, torch.zeros(4, 4, 3), None, None, f"{k}") for k in range(6)]
-    rig = Dataset(frames, folder=Path("rig"), split="train")
-    assert neighbors_in_time(rig).tolist() == [[0, 2], [1, 3], [0, 4], [1, 5], [2, 4], [3, 5]]
 
 
 def test_the_penalty_knows_identity_and_neighbours():
