@@ -15,6 +15,7 @@ import numpy as np
 import torch
 
 from scgs_warp.edit import EditSession
+from scgs_warp.gaussians import SH_C0
 from scgs_warp.geometry.cameras import orbit_camera
 from scgs_warp.rendering.render import render
 from scgs_warp.runtime.environment import configure
@@ -22,8 +23,6 @@ from scgs_warp.scene.scene import Scene
 from scgs_warp.visualization.video import write_png
 
 TIMES = (0.0, 0.5, 1.0)
-FIRST_HARMONIC = 0.28209479177387814
-"""Colour per coefficient of degree 0."""
 GOLDEN = 0.61803399
 """Step of the hue from part to part, which keeps neighbours in the list apart."""
 
@@ -42,7 +41,7 @@ def row_of(run: Path, size: int) -> np.ndarray:
     camera, white, pictures = orbit_camera(scene.overview, scene.overview.azimuth, size), torch.ones(3), []
     for time in TIMES:
         posed = session.engine.normalised(time, None)
-        flat = torch.from_numpy((colors - 0.5) / FIRST_HARMONIC).float().reshape(posed.sh_dc.shape)
+        flat = torch.from_numpy((colors - 0.5) / SH_C0).float().reshape(posed.sh_dc.shape)
         painted = dataclasses.replace(posed, sh_dc=flat, sh_rest=torch.zeros_like(posed.sh_rest))
         view = scene.normalisation.apply_camera(camera)
         pictures.append(scene.render(camera, time, white).rgb)
