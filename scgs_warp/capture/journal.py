@@ -14,10 +14,10 @@ from typing import Any
 
 from ..errors import UserError
 from ..storage.files import read_text
-from ..storage.json_files import parse_json
+from ..storage.json_files import parse_json, write_json
 from ..storage.locks import AlreadyLocked, lock_file
 from ..storage.output_folders import paths_in
-from .writing import FILE, write_text
+from .writing import FILE
 
 WORK = "work"
 """Folder of intermediate files; it may be deleted when the data set is complete."""
@@ -150,8 +150,7 @@ class Journal:
         return UserError(f"{self.file}: the result of {name} is damaged; remove {self.folder}, and capture again")
 
     def _save(self) -> None:
-        content = {"source": self._source, "stages": self._stages}
-        write_text(self.file, json.dumps(content, indent=1) + "\n")
+        write_json(self.file, {"source": self._source, "stages": self._stages})
 
 
 @contextmanager

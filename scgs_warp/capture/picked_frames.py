@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import math
 import shutil
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import AbstractContextManager
+from collections.abc import Iterator, Sequence
 from itertools import islice, takewhile
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -13,6 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..errors import UserError
+from ..runtime.progress import ShowProgress
 from ..storage.json_files import as_number
 from ..visualization.video import write_png
 from . import moving, picking
@@ -27,8 +27,6 @@ from .source_frame import SourceFrame
 MAX_SECONDS = 1e9
 """Largest plausible time in a film, seconds."""
 VIDEO_FRAMES = 150
-
-ShowProgress = Callable[[int, str], AbstractContextManager[Any]]
 
 
 class PickedFrames(NamedTuple):

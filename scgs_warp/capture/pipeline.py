@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..errors import UserError
-from ..runtime.progress import progress
+from ..runtime.progress import ShowProgress, progress
 from ..storage.json_files import as_number
 from ..visualization.video import write_png
 from . import bundle_adjustment, features, mapping, moving, pictures, writing
@@ -20,7 +20,7 @@ from .features import FrameFiles
 from .folder_content import photographs_left_out
 from .given_masks import read_masks
 from .journal import Journal, disk_errors
-from .picked_frames import VIDEO_FRAMES, PickedFrames, ShowProgress, pick_frames
+from .picked_frames import VIDEO_FRAMES, PickedFrames, pick_frames
 from .request import MIN_FRAMES, CaptureRequest, check
 from .source import Source, is_hidden, open_source, read_rgb
 

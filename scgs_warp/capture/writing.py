@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Literal, NamedTuple, Protocol
@@ -13,7 +12,7 @@ import numpy as np
 from ..data.held_out import held_out
 from ..data.points import write_points
 from ..geometry.rotation import OPENGL_TO_OPENCV
-from ..storage.files import write_atomically
+from ..storage.json_files import write_json
 from ..visualization.video import write_png
 from .colmap import quiet
 from .cut_out import HIDDEN, moved
@@ -194,9 +193,4 @@ def write_scene(folder: Path, scene: CapturedScene, keep: Keep = "all") -> None:
         "frames": frames,
         **{f"{split}_filenames": [inside[index] for index in chosen] for split, chosen in lists.items()},
     }
-    write_text(folder / FILE, json.dumps(content, indent=1) + "\n")
-
-
-def write_text(path: Path, text: str) -> None:
-    """Write a text file atomically."""
-    write_atomically(path, text.encode("utf-8"))
+    write_json(folder / FILE, content)

@@ -73,7 +73,7 @@ def control_points_of(path: Path) -> int:
 
 
 def checked(edit: Edit, engine: Engine) -> Edit:
-    """Convert an edit to the JSON object that a file holds.
+    """Return an edit with its fields checked and converted, as reading it back from its file would.
 
     Raises:
         UserError: naming a field that no file may hold.

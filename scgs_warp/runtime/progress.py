@@ -25,10 +25,11 @@ LINE_LONGEST = 30.0
 RATE_SECONDS = 15.0
 """Seconds over which the rate is measured: only recent steps count, because added Gaussians slow the steps down."""
 
-
 Result = TypeVar("Result")
 Report = Callable[[str, int, int], Any]
 """Function that is called with (work, done, total) after each step."""
+ShowProgress = Callable[[int, str], AbstractContextManager[Any]]
+"""Function from a number of steps and the name of the work to a context manager like that of :func:`progress`."""
 _report: ContextVar[Report | None] = ContextVar("report", default=None)
 
 

@@ -1,4 +1,4 @@
-"""JSON from files that others wrote, and the numbers in it."""
+"""JSON: reading of what others wrote, and of the numbers in it, and writing."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import UserError
-from .files import read_text
+from .files import read_text, write_atomically
 
 
 def parse_json(text: str | bytes, **hooks: Any) -> Any:
@@ -55,6 +55,15 @@ def read_json(path: Path, needed: str = "restore it") -> dict[str, Any]:
     if not isinstance(content, dict):
         raise UserError(f"{path}: holds no JSON object; restore the file")
     return content
+
+
+def write_json(path: Path, content: Any) -> None:
+    """Write JSON atomically, one value a line.
+
+    Raises:
+        UserError: the file cannot be written; an earlier one is intact.
+    """
+    write_atomically(path, (json.dumps(content, indent=1) + "\n").encode("utf-8"))
 
 
 def as_number(value: Any) -> float | None:

@@ -7,12 +7,12 @@ import shutil
 import tempfile
 import zipfile
 import zlib
-from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 from ...errors import UserError
+from ...runtime.progress import ShowProgress
 from ...storage.output_folders import make_parent
 
 ZIPPED = (".zip", ".r3d")
@@ -24,8 +24,6 @@ LEAST_FREE = 1 << 30
 BLOCK = 1 << 20
 ENCRYPTED = 0x1
 """Bit of a member's flags."""
-
-ShowProgress = Callable[[int, str], AbstractContextManager[Any]]
 
 
 @contextmanager

@@ -17,14 +17,14 @@ from ...data.orientation import UPRIGHT, read_orientation
 from ...data.points import write_points
 from ...errors import UserError
 from ...geometry.rotation import OPENGL_TO_OPENCV
-from ...runtime.progress import progress
+from ...runtime.progress import ShowProgress, progress
 from ...storage.files import read_bytes
 from ...storage.output_folders import paths_in, write_folder_atomically
 from ...visualization.video import write_png
 from ..similarity import Similarity, upright
 from ..source import read_rgb
 from . import agreement, arrays, frame_folders, monst3r, phone_apps, pi3, stray_scanner, vipe
-from .archives import ShowProgress, unpacked
+from .archives import unpacked
 from .depth_writing import DepthWriter, checked_depth, known_depth
 from .scene import MAX_NUMBER, ImportedFrame, ImportedScene
 

@@ -5,9 +5,8 @@ from __future__ import annotations
 import os
 import shutil
 from collections.abc import Callable
-from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -15,6 +14,7 @@ from ...data.points import write_points
 from ...data.readers.poses_bounds import FILE as POSES
 from ...data.readers.poses_bounds import POINTS, read_rows, row_lens, row_viewmat
 from ...errors import UserError
+from ...runtime.progress import ShowProgress
 from ...storage.files import read_bytes, write_atomically
 from .cameras import RigCamera
 
@@ -62,7 +62,7 @@ def write_neural_video(
     instants: int,
     picture_file: Callable[[int, int], Path],
     points: tuple[np.ndarray, np.ndarray],
-    show: Callable[[int, str], AbstractContextManager[Any]],
+    show: ShowProgress,
 ) -> None:
     """Write ``CAMERA/images/0000.png``, points, and then ``poses_bounds.npy``, whose presence marks a complete folder.
 

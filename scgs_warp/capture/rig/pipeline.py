@@ -5,15 +5,13 @@ from __future__ import annotations
 import hashlib
 import math
 import shutil
-from collections.abc import Callable
-from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from ...errors import UserError
-from ...runtime.progress import progress
+from ...runtime.progress import ShowProgress, progress
 from ...storage.json_files import as_number
 from ...visualization.video import write_png
 from .. import features, pictures
@@ -32,8 +30,6 @@ from .sound import read_sound
 from .writing import FEW_CAMERAS, write_rig
 
 SHEET = "contact_sheet.png"
-
-ShowProgress = Callable[[int, str], AbstractContextManager[Any]]
 
 
 class RigResult(NamedTuple):

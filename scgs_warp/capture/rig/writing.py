@@ -3,21 +3,20 @@ points."""
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
 
 from ...data.points import write_points
 from ...geometry.rotation import OPENGL_TO_OPENCV
+from ...runtime.progress import ShowProgress
+from ...storage.json_files import write_json
 from ...visualization.video import write_png
 from .. import pictures
 from ..similarity import upright
-from ..writing import FILE, POINTS, CapturedScene, Pinhole, as_held, pinhole_of, write_text
+from ..writing import FILE, POINTS, CapturedScene, Pinhole, as_held, pinhole_of
 from .cameras import RigCamera, RigSolution
 from .instants import TimeLine
 
@@ -55,7 +54,7 @@ def write_rig(
     line: TimeLine,
     held_out: str,
     picture: Callable[[int, int], np.ndarray],
-    show: Callable[[int, str], AbstractContextManager[Any]],
+    show: ShowProgress,
     turns: Sequence[int] = (),
 ) -> None:
     """Write ``images/``, ``points.ply``, a plot of the cameras, and then ``transforms.json``, whose presence marks a
@@ -107,7 +106,7 @@ def write_rig(
         "train_filenames": splits["train"],
         "test_filenames": splits["test"],
     }
-    write_text(folder / FILE, json.dumps(content, indent=1) + "\n")
+    write_json(folder / FILE, content)
 
 
 def _first_instant(
