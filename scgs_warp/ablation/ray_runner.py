@@ -388,9 +388,9 @@ def steps_done(folder: Path) -> int:
     return 0
 
 
-def appears(path: Path, seconds: float = VISIBLE_SECONDS) -> bool:
-    """Wait for a file of another machine; return False if it does not appear in time."""
-    until = time.monotonic() + seconds
+def appears(path: Path) -> bool:
+    """Wait for a file of another machine; return False if it does not appear in ``VISIBLE_SECONDS``."""
+    until = time.monotonic() + VISIBLE_SECONDS
     while not path.is_file():
         if time.monotonic() > until:
             return False

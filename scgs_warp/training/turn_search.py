@@ -103,14 +103,14 @@ def find_turns(body: RoundBody, views: Views) -> Turns | None:
 
 def _clearer(surface: Surface, rates: np.ndarray) -> float:
     """Return the residual of turns per instant, [T - 1, 3], relative to that without turns."""
-    starts = _starts(surface.views.count, WINDOW, STRIDE)
+    starts = _starts(surface.views.count, WINDOW)
     still = _cost(surface, starts, WINDOW, _integrated(0.0 * rates))
     return _cost(surface, starts, WINDOW, _integrated(rates)) / max(still, 1e-12)
 
 
-def _starts(count: int, length: int, stride: int) -> list[int]:
-    """Return the first instants of windows that cover ``count`` instants."""
-    starts = list(range(0, count - length + 1, stride))
+def _starts(count: int, length: int) -> list[int]:
+    """Return the first instants of windows of ``length`` that cover ``count`` instants, ``STRIDE`` apart."""
+    starts = list(range(0, count - length + 1, STRIDE))
     return starts if starts[-1] == count - length else [*starts, count - length]
 
 
@@ -120,7 +120,7 @@ def _search(surface: Surface, views: Views) -> np.ndarray:
     axis = np.radians(np.arange(-FASTEST, FASTEST + 1e-6, STEP))
     rates = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3)
     rates = rates[np.linalg.norm(rates, axis=1) < np.radians(FASTEST) + 1e-6]
-    starts, costs = _starts(views.count, WINDOW, STRIDE), []
+    starts, costs = _starts(views.count, WINDOW), []
     for start in starts:
         window = views.within(start, WINDOW)
         since = views.instants[window.start : window.stop] - (start + 0.5 * (WINDOW - 1))
@@ -173,7 +173,7 @@ def _refined(surface: Surface, rates: np.ndarray) -> np.ndarray:
     for step in np.radians(FINE):
         for knot, middle in enumerate(knots):
             first = int(min(max(0, middle - LONG), count - LONG))
-            starts = [start for start in _starts(count, LONG, STRIDE) if first <= start <= middle + STRIDE]
+            starts = [start for start in _starts(count, LONG) if first <= start <= middle + STRIDE]
             best = _cost(surface, starts, LONG, _integrated(_between(knots, values, count)))
             for axis in range(3):
                 for change in (step, -step):

@@ -69,9 +69,9 @@ def size_step(path: str | Path) -> int:
     return 2 if Path(path).suffix.lower() == ".mp4" else 1
 
 
-def frame_gib(width: int, height: int | None = None) -> float:
-    """Return the memory in GiB that a frame takes while it is rendered and written; without ``height`` it is square."""
-    return PIXEL_BYTES * width * (height or width) / 2**30
+def frame_gib(size: int) -> float:
+    """Return the memory in GiB that a square frame takes while it is rendered and written."""
+    return PIXEL_BYTES * size**2 / 2**30
 
 
 def require_memory(path: str | Path, width: int, height: int, frames: int, device: str) -> None:

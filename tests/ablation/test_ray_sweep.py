@@ -143,7 +143,6 @@ def test_failures_stop_no_other(blobs, tmp_path):
 def test_results_that_are_not_seen_are_a_failure(blobs, tmp_path, monkeypatch):
     monkeypatch.setattr(ray_runner, "VISIBLE_SECONDS", 0.0)
     monkeypatch.setattr(FakeRay, "get", lambda self, ref: {"failure": None, "stopped": False})
-    monkeypatch.setattr(ray_runner, "appears", lambda path: False)
     _, ends = sweep(FakeRay(), plan(blobs, tmp_path, "8"))
     assert ends["8"] is not None and "is the folder shared?" in ends["8"]
 

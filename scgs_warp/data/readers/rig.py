@@ -42,7 +42,6 @@ def read_rig(
     options: ReadOptions,
     *,
     held: Collection[str] = (),
-    notes: Sequence[str] = (),
 ) -> Dataset:
     """Read one split: the cameras ``held`` or, if none of the chosen ones is among them, the first in the order of
     names is ``test`` and ``val``; the others are ``train``. Times are those in the names of the instants.
@@ -87,7 +86,7 @@ def read_rig(
         )
         for index in choice.indices
     ]
-    return assemble(records, options, folder=folder, split=split, notes=(*notes, *lines, *choice.notes))
+    return assemble(records, options, folder=folder, split=split, notes=(*lines, *choice.notes))
 
 
 def images_in(folder: Path) -> dict[str, Path]:

@@ -159,10 +159,10 @@ PARTS: tuple[Part, ...] = (
 )  # fmt: skip
 
 
-def build_figure(parts: tuple[Part, ...] = PARTS) -> PartMesh:
-    """Build the mesh of all parts."""
+def build_figure() -> PartMesh:
+    """Build the mesh of ``PARTS``."""
     pieces = []
-    for part in parts:
+    for part in PARTS:
         if part.hole > 0:
             vertices, faces = torus(part.hole, part.half[2], part.divisions)
         else:

@@ -39,14 +39,14 @@ class Hits(NamedTuple):
 class Stage:
     """A moving surface that stands in a room."""
 
-    def __init__(self, mover: Surface, device: str, shading: Shading | None = None) -> None:
+    def __init__(self, mover: Surface, device: str) -> None:
         self.device = device
         self.mover = mover
         self.floor = min(float(mover.posed(time)[0][:, 2].min()) for time in np.linspace(0.0, 1.0, FLOOR_TIMES))
         self.surface = JoinedSurfaces([mover, Room(self.floor)])
         self.moving_faces = len(mover.faces)
         """Faces with lower indices move."""
-        self.caster = Raycaster(self.surface, device, shading, LAMP)
+        self.caster = Raycaster(self.surface, device, lamp=LAMP)
         self._lit: tuple[float, PosedSurface] | None = None
 
     def pose(self, time: float) -> PosedSurface:
@@ -103,13 +103,13 @@ class Stage:
         )
 
 
-def stage_of(subject: str, device: str, shading: Shading | None = None) -> Stage:
+def stage_of(subject: str, device: str) -> Stage:
     """Make the stage of a built-in subject; ``robot`` walks about."""
     from ..zoo import SUBJECTS
     from ..zoo.subject import SurfaceSubject
 
     if subject == "robot":
-        return Stage(RigidParts(build_figure(), walking_transforms), device, shading)
-    made = SUBJECTS[subject](device, shading or Shading())
+        return Stage(RigidParts(build_figure(), walking_transforms), device)
+    made = SUBJECTS[subject](device, Shading())
     assert isinstance(made, SurfaceSubject)
-    return Stage(made.surface, device, shading)
+    return Stage(made.surface, device)

@@ -14,7 +14,7 @@ from ..renderer import GROUND_TRUTH_TIMES
 from ..shading import Shading
 from ..solids import Vector, capsule
 from ..surface import Material, Piece, RigidParts, merge, placed
-from .rod_skeleton import RODS, Rod, bone_transforms
+from .rod_skeleton import RODS, bone_transforms
 from .subject import SurfaceSubject
 
 FILE = "rods.npz"
@@ -51,9 +51,9 @@ def _material(group: str, dark: bool) -> Material:
     return Material(int(patterns.STRIPES), (first, second, third), (0.0, 0.0, 13.0))
 
 
-def _axes(rods: Sequence[Rod]) -> np.ndarray:
-    """Return the end points [R, 2, 3] of rods, in the frames of their bones."""
-    return np.array([(rod.start, rod.end) for rod in rods], np.float64)
+def _axes() -> np.ndarray:
+    """Return the end points [R, 2, 3] of ``RODS``, in the frames of their bones."""
+    return np.array([(rod.start, rod.end) for rod in RODS], np.float64)
 
 
 def _along(start: np.ndarray, end: np.ndarray) -> np.ndarray:
@@ -70,7 +70,7 @@ class RodsSubject(SurfaceSubject):
 
     def __init__(self, device: str, shading: Shading, dark: bool) -> None:
         pieces = []
-        for rod, (start, end) in zip(RODS, _axes(RODS)):
+        for rod, (start, end) in zip(RODS, _axes()):
             solid = capsule(float(np.linalg.norm(end - start)), rod.radius, LIGHT_STEP)
             pieces.append(Piece(*solid, _material(rod.group, dark), rod.bone, _along(start, end)))
         self.rigid = RigidParts(merge(pieces), bone_transforms)
@@ -78,7 +78,7 @@ class RodsSubject(SurfaceSubject):
 
     def ends(self, times: Sequence[float]) -> np.ndarray:
         """Return the end points of the rods' axes, [T, R, 2, 3] float64, world; rods reach one radius farther."""
-        axes, found = _axes(RODS), []
+        axes, found = _axes(), []
         for time in times:
             moves = self.rigid.part_transforms(float(time))
             found.append(np.einsum("rij,rej->rei", moves[:, :3, :3], axes) + moves[:, None, :3, 3])
