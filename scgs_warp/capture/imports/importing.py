@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -38,6 +39,13 @@ POINT_COUNT = 40_000
 MAX_MOMENT = 1e19
 """Largest time of a frame, in the unit of the file: microseconds since 1970 are below it."""
 
+LAYOUTS: tuple[tuple[Callable[[Path], bool], Callable[[Path], ImportedScene]], ...] = (
+    *((module.recognises, module.read) for module in (vipe, pi3, arrays, monst3r, stray_scanner)),
+    *frame_folders.LAYOUTS,
+    *phone_apps.LAYOUTS,
+)
+"""What recognises a file or folder of a layout, and its reader, in the order in which they are tried."""
+
 
 class ImportResult(NamedTuple):
     """Result of an import."""
@@ -60,22 +68,11 @@ def read_scene(path: Path) -> ImportedScene:
     """
     if not path.exists():
         raise UserError(f"--poses {path}: no such file or folder; give what the other program exported")
-    if vipe.is_vipe(path):
-        return vipe.read_vipe(path)
-    if pi3.recognises(path):
-        return pi3.read(path)
-    if arrays.recognises(path):
-        return arrays.read(path)
-    if path.is_dir():
-        if monst3r.recognises(path):
-            return monst3r.read(path)
-        if stray_scanner.is_stray(path):
-            return stray_scanner.read_stray(path)
-        for recognises, read in (*frame_folders.LAYOUTS, *phone_apps.LAYOUTS):
-            if recognises(path):
-                return read(path)
-        if (path / FILE).is_file():
-            raise UserError(f"--poses {path}: is in nerfstudio's layout already; python apps/train.py --data {path}")
+    for recognises, read in LAYOUTS:
+        if recognises(path):
+            return read(path)
+    if (path / FILE).is_file():
+        raise UserError(f"--poses {path}: is in nerfstudio's layout already; python apps/train.py --data {path}")
     raise UserError(
         f"--poses {path}: is no scene of MegaSaM, VGGT, Depth Anything 3 or Pi3 (.npz), MonST3R "
         f"({monst3r.TRAJECTORY}), ViPE (pose, rgb), CUT3R (camera, color), DA3-Streaming ({frame_folders.POSES}), "

@@ -25,12 +25,12 @@ POSE = ("timestamp", "frame", "x", "y", "z", "qx", "qy", "qz", "qw")
 INTRINSICS = ("fx", "fy", "cx", "cy")
 
 
-def is_stray(path: Path) -> bool:
+def recognises(path: Path) -> bool:
     """Return whether the folder is a recording of Stray Scanner."""
     return (path / TRACK).is_file() and (path / FILM).is_file()
 
 
-def read_stray(path: Path) -> ImportedScene:
+def read(path: Path) -> ImportedScene:
     """Read a recording; of more than ``MOST_FRAMES`` frames, every second, third or so is taken.
 
     Raises:

@@ -30,7 +30,7 @@ MAX_MAP_BYTES = 1 << 27
 """Largest size of a depth map's file."""
 
 
-def is_vipe(path: Path) -> bool:
+def recognises(path: Path) -> bool:
     """Return whether the path is a folder of results, or a film, the poses or the intrinsics in one."""
     return bool(_names(path))
 
@@ -48,7 +48,7 @@ def _names(path: Path) -> list[tuple[Path, str]]:
     ]
 
 
-def read_vipe(path: Path) -> ImportedScene:
+def read(path: Path) -> ImportedScene:
     """Read a result; of more than ``MOST_FRAMES`` frames, every second, third or so is taken.
 
     Raises:
