@@ -20,7 +20,7 @@ from scgs_warp.geometry.cameras import orbit_camera
 from scgs_warp.rendering.render import render
 from scgs_warp.runtime.environment import configure
 from scgs_warp.scene.scene import Scene
-from scgs_warp.visualization.video import write_png
+from scgs_warp.storage.png_files import write_png
 
 TIMES = (0.0, 0.5, 1.0)
 GOLDEN = 0.61803399

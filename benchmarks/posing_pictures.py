@@ -36,8 +36,8 @@ from scgs_warp.geometry.cameras import orbit_camera
 from scgs_warp.runtime.environment import configure
 from scgs_warp.runtime.provenance import command_line, provenance
 from scgs_warp.scene.scene import Scene
+from scgs_warp.storage.png_files import write_png
 from scgs_warp.types import Camera
-from scgs_warp.visualization.video import write_png
 
 LIMBS = {
     "shoulder": ("shoulder_left", (0.0, -1.0, 0.0), "elbow_left"),

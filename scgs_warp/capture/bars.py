@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..visualization.video import write_png
+from ..storage.png_files import write_png
 from .source import read_rgb
 
 BLACK = 24

@@ -14,7 +14,7 @@ import numpy as np
 from ..errors import UserError
 from ..runtime.progress import ShowProgress
 from ..storage.json_files import as_number
-from ..visualization.video import write_png
+from ..storage.png_files import write_png
 from . import moving, picking
 from .bars import Bars, cut_off, find_bars
 from .completeness import Incomplete

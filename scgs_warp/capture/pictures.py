@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from ..data.dataset import spread
-from ..visualization.video import write_png
+from ..storage.png_files import write_png
 from .writing import CapturedScene
 
 MAX_PICTURES = 48

@@ -12,7 +12,7 @@ import numpy as np
 from ..errors import UserError
 from ..runtime.progress import ShowProgress, progress
 from ..storage.json_files import as_number
-from ..visualization.video import write_png
+from ..storage.png_files import write_png
 from . import bundle_adjustment, features, mapping, moving, pictures, writing
 from .colmap import remove_database
 from .diagnosis import Outcome, notes, too_few, unseen_between, unseen_ends

@@ -13,7 +13,7 @@ from ..data.held_out import held_out
 from ..data.points import write_points
 from ..geometry.rotation import OPENGL_TO_OPENCV
 from ..storage.json_files import write_json
-from ..visualization.video import write_png
+from ..storage.png_files import write_png
 from .colmap import quiet
 from .cut_out import HIDDEN, moved
 from .features import FrameFiles

@@ -20,9 +20,9 @@ from ..scene.scene import Scene
 from ..storage.checkpoint import DISK_FULL
 from ..storage.files import write_atomically
 from ..storage.output_folders import make_parent
+from ..storage.png_files import write_png
 from ..types import Frame
 from ..visualization.figures import contact_sheet, to_bytes
-from ..visualization.video import write_png
 from .coverage import compare_alpha, coverage_row, summarise
 from .image_metrics import psnr, ssim
 from .motion_metrics import load_ground_truth, score_motion

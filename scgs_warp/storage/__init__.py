@@ -1,1 +1,1 @@
-"""Files and folders: atomic writing, checkpoints, JSON, NumPy arrays, output folders, safe paths."""
+"""Files and folders: atomic writing, checkpoints, JSON, NumPy arrays, pictures, output folders, safe paths."""

@@ -17,6 +17,7 @@ import numpy as np
 from ..errors import UserError
 from ..storage.files import for_ffmpeg, hidden_beside
 from ..storage.output_folders import check_replaceable, make_parent, replace_folder
+from ..storage.png_files import write_png
 
 SUFFIXES = (".mp4", ".gif", "")
 """Suffixes that ``film`` accepts; an empty one stands for a folder of PNGs."""
@@ -257,19 +258,6 @@ class _Folder(FilmWriter):
     def publish(self) -> None:
         check_frames(self.path)
         replace_folder(self.path, self.temporary)
-
-
-def write_png(path: Path, image: np.ndarray) -> None:
-    """Write [H, W, 3] uint8 RGB, or [H, W, 4] with straight alpha, losslessly.
-
-    Raises:
-        OSError: the file cannot be written.
-    """
-    import cv2
-
-    swapped = image[..., [2, 1, 0, 3]] if image.shape[2] == 4 else image[..., ::-1]
-    encoded = cv2.imencode(".png", swapped, [cv2.IMWRITE_PNG_COMPRESSION, 4])[1]
-    path.write_bytes(encoded.data)  # Unlike numpy's tofile, this reports why it failed.
 
 
 @contextmanager

@@ -8,7 +8,7 @@ import pytest
 from helpers.films import pan
 from scgs_warp.capture.bars import EDGE, Bars, cut_off, find_bars
 from scgs_warp.capture.source import read_rgb
-from scgs_warp.visualization.video import write_png
+from scgs_warp.storage.png_files import write_png
 
 
 def brightest(top: int = 0, bottom: int = 0, left: int = 0, right: int = 0, seed: int = 0) -> np.ndarray:

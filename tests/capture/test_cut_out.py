@@ -7,7 +7,7 @@ import numpy as np
 
 from scgs_warp.capture import cut_out
 from scgs_warp.capture.source import Folder, is_hidden, read_cut_out
-from scgs_warp.visualization.video import write_png
+from scgs_warp.storage.png_files import write_png
 
 
 def disc(color=(200, 100, 50), hidden=(0, 255, 0)) -> np.ndarray:

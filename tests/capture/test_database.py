@@ -15,7 +15,7 @@ from scgs_warp.capture import features
 from scgs_warp.capture.colmap import opened, remove_database
 from scgs_warp.capture.features import FrameFiles
 from scgs_warp.errors import UserError
-from scgs_warp.visualization.video import write_png
+from scgs_warp.storage.png_files import write_png
 
 PAIRS = [(0, 1), (0, 2), (1, 2)]
 

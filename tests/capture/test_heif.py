@@ -12,7 +12,7 @@ from PIL import Image
 from scgs_warp.capture.source import Folder, read_cut_out, read_rgb, turns_of
 from scgs_warp.errors import UserError
 from scgs_warp.storage import heif_files
-from scgs_warp.visualization.video import write_png
+from scgs_warp.storage.png_files import write_png
 
 pillow_heif = pytest.importorskip("pillow_heif")
 ORIENTATION = 0x112

@@ -28,8 +28,8 @@ from scgs_warp.capture.similarity import align, centres
 from scgs_warp.capture.source import open_source
 from scgs_warp.data import load
 from scgs_warp.errors import UserError
+from scgs_warp.storage.png_files import write_png
 from scgs_warp.visualization.video import film as film_writer
-from scgs_warp.visualization.video import write_png
 
 FRAMES = 22
 

@@ -18,7 +18,8 @@ from scgs_warp.capture.rig.instants import frame_seconds
 from scgs_warp.capture.source import Folder, Video, open_source
 from scgs_warp.errors import UserError
 from scgs_warp.storage import heif_files
-from scgs_warp.visualization.video import film, write_png
+from scgs_warp.storage.png_files import write_png
+from scgs_warp.visualization.video import film
 
 
 def test_a_video_keeps_its_moments(tmp_path):

@@ -27,7 +27,8 @@ from scgs_warp.edit import EditSession
 from scgs_warp.edit.filming import film_camera
 from scgs_warp.export.captions import read_captions
 from scgs_warp.scene.scene import Scene
-from scgs_warp.visualization.video import film, write_png
+from scgs_warp.storage.png_files import write_png
+from scgs_warp.visualization.video import film
 
 EDIT = {
     "format": "scgs-warp edit", "version": 2, "comment": "all there is",

@@ -7,7 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from scgs_warp.visualization.video import write_png
+from scgs_warp.storage.png_files import write_png
 
 
 def wall(seed: int = 0, height: int = 200, width: int = 700) -> np.ndarray:

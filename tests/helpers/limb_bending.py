@@ -180,7 +180,7 @@ def picture(session: EditSession, size: int = 220) -> np.ndarray:
 
 def main() -> None:
     from scgs_warp.scene.scene import Scene
-    from scgs_warp.visualization.video import write_png
+    from scgs_warp.storage.png_files import write_png
 
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--run", type=Path, nargs="+", required=True)

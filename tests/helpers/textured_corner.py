@@ -11,7 +11,7 @@ from scgs_warp.capture.colmap import quiet
 from scgs_warp.capture.features import FrameFiles
 from scgs_warp.capture.rig.cameras import RigCamera, straightened
 from scgs_warp.capture.rig.points import lens_of
-from scgs_warp.visualization.video import write_png
+from scgs_warp.storage.png_files import write_png
 
 WIDTH, HEIGHT, FOCAL = 320, 240, 280.0
 ANGLES = (-24.0, -12.0, 0.0, 12.0, 24.0)

@@ -21,7 +21,7 @@ from ...geometry.rotation import OPENGL_TO_OPENCV
 from ...runtime.progress import ShowProgress, progress
 from ...storage.files import read_bytes
 from ...storage.output_folders import paths_in, write_folder_atomically
-from ...visualization.video import write_png
+from ...storage.png_files import write_png
 from ..similarity import Similarity, upright
 from ..source import read_rgb
 from . import agreement, arrays, frame_folders, monst3r, phone_apps, pi3, stray_scanner, vipe

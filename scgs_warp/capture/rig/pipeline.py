@@ -13,7 +13,7 @@ import numpy as np
 from ...errors import UserError
 from ...runtime.progress import ShowProgress, progress
 from ...storage.json_files import as_number
-from ...visualization.video import write_png
+from ...storage.png_files import write_png
 from .. import features, pictures
 from ..colmap import remove_database
 from ..features import FrameFiles

@@ -13,7 +13,7 @@ from ...data.points import write_points
 from ...geometry.rotation import OPENGL_TO_OPENCV
 from ...runtime.progress import ShowProgress
 from ...storage.json_files import write_json
-from ...visualization.video import write_png
+from ...storage.png_files import write_png
 from .. import pictures
 from ..similarity import upright
 from ..writing import FILE, POINTS, CapturedScene, Pinhole, as_held, pinhole_of

@@ -10,7 +10,6 @@ from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import cv2
 import numpy as np
 
 from ...errors import UserError
@@ -275,7 +274,7 @@ def synthesize(planned: SynthesisPlan, progress: Callable[[int, int], None] | No
 
     def write(work: Path) -> None:
         write_pictures(work, planned.subject, planned.points, planned.pictures, optics, done, sheet)
-        write_png(work / SHEET, cv2.cvtColor(sheet.draw(), cv2.COLOR_RGB2BGR))
+        write_png(work / SHEET, sheet.draw())
         if isinstance(planned.subject, RodsSubject):
             times = {split: [picture.time for picture in own] for split, own in planned.pictures.items()}
             planned.subject.write_rods(work, times)

@@ -13,6 +13,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 import torch
 
+from ...geometry.rotation import OPENGL_TO_OPENCV
 from ...types import Camera
 
 Arrangement = Literal["sphere", "path"]
@@ -154,7 +155,7 @@ def plan_pictures(filming: FilmingSettings, rng: np.random.Generator) -> dict[st
 
 def camera_of(camera_to_world: np.ndarray, fov: float, width: int, height: int) -> Camera:
     """Make the camera of a picture. ``fov`` is horizontal, in radians."""
-    viewmat = np.linalg.inv(camera_to_world @ np.diag([1.0, -1.0, -1.0, 1.0]))
+    viewmat = np.linalg.inv(camera_to_world @ OPENGL_TO_OPENCV)
     focal = 0.5 * width / math.tan(0.5 * fov)
     K = torch.tensor([[focal, 0.0, 0.5 * width], [0.0, focal, 0.5 * height], [0.0, 0.0, 1.0]])
     return Camera(torch.from_numpy(viewmat).float(), K, width, height)

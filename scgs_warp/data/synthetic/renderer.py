@@ -111,7 +111,7 @@ def write_rgba(path: Path, image: np.ndarray) -> None:
     alpha = image[..., 3:]
     color = np.where(alpha > 0, image[..., :3] / np.maximum(alpha, 1e-6), 0.0)
     pixels = np.concatenate([color, alpha], axis=-1).clip(0.0, 1.0) * 255.0
-    write_png(path, cv2.cvtColor(np.rint(pixels).astype(np.uint8), cv2.COLOR_RGBA2BGRA))
+    write_png(path, np.rint(pixels).astype(np.uint8))
 
 
 def over_gray(image: np.ndarray, gray: float) -> np.ndarray:
@@ -120,8 +120,10 @@ def over_gray(image: np.ndarray, gray: float) -> np.ndarray:
 
 
 def write_png(path: Path, pixels: np.ndarray) -> None:
-    """Write pixels in OpenCV's channel order; raise OSError if that fails."""
-    ok, data = cv2.imencode(".png", pixels)
+    """Write [H, W, 3] uint8 RGB, or [H, W, 4] with straight alpha; raise OSError if that fails. The compression is
+    OpenCV's own, on which the bytes of a data set depend."""
+    swapped = cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR if pixels.shape[2] == 3 else cv2.COLOR_RGBA2BGRA)
+    ok, data = cv2.imencode(".png", swapped)
     if not ok:
         raise OSError(0, "PNG encoding failed")
     path.write_bytes(data.tobytes())
@@ -133,7 +135,7 @@ def write_picture(path: Path, image: np.ndarray, background: Background) -> None
         write_rgba(path, image)
         return
     pixels = over_gray(image, 1.0 if background == "white" else 0.0).clip(0.0, 1.0) * 255.0
-    write_png(path, cv2.cvtColor(np.rint(pixels).astype(np.uint8), cv2.COLOR_RGB2BGR))
+    write_png(path, np.rint(pixels).astype(np.uint8))
 
 
 class Watcher(Protocol):

@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ....geometry.rotation import OPENGL_TO_OPENCV
 from ....storage.numpy_files import read_npy
 from ....types import Camera
 from ...points import write_points
@@ -33,7 +34,6 @@ VISIBLE_EVERY = 6
 """Stride of the frames whose visible points are determined."""
 BUMPS, DEPTH_BLUR = (6, 8), 2.0
 """Rows and columns of the errors of a depth map; standard deviation by which its outlines are blurred, pixels."""
-OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 
 
 def write_truth(folder: Path, shooting: Shooting) -> None:
@@ -111,7 +111,7 @@ def write_data_set(
     frames, train, some = [], [], {}
     for index, picture in enumerate(decoded(folder / take.file)):
         name = f"images/frame_{index:05d}.png"
-        write_png(folder / name, cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))
+        write_png(folder / name, picture)
         if index % VISIBLE_EVERY == 0:
             some[index] = picture
         second = float(take.seconds[index])
@@ -151,7 +151,7 @@ def _depth_of(folder: Path, take: Take, index: int, request: FilmRequest) -> str
 
 
 def _entry(name: str, viewmat: np.ndarray, time: float) -> dict[str, object]:
-    return {"file_path": name, "transform_matrix": (np.linalg.inv(viewmat) @ OPENGL).tolist(), "time": time}
+    return {"file_path": name, "transform_matrix": (np.linalg.inv(viewmat) @ OPENGL_TO_OPENCV).tolist(), "time": time}
 
 
 def _write_held_out(
@@ -168,7 +168,7 @@ def _write_held_out(
         image = stage.caster.render(stage.pose(time), still.camera(0.0), request.samples)[..., :3]
         pixels = (image.clamp(0.0, 1.0) * 255.0).round().to(torch.uint8).cpu().numpy()
         names.append(f"images/held_out_{index:03d}.png")
-        write_png(folder / names[-1], cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR))
+        write_png(folder / names[-1], pixels)
         frames.append(_entry(names[-1], viewmat, time))
         done()
     return names
