@@ -43,7 +43,6 @@ first chunk must not end last."""
 MAX_CHUNKS_PER_SHARE = 32
 """Largest number of chunks in a thread's fair share of the whole grid; it limits how small chunks get."""
 
-
 IMPATIENCE = 1.5e-4
 """Seconds for which the caller, which waits for the last chunks, offers its core without sleeping. Since Python 3.11, a
 sleep of 0 seconds takes 50 microseconds or more on Linux, as long as a short kernel."""

@@ -24,8 +24,6 @@ NEAREST_CAMERAS = 0.05
 INSIDE = 0.1
 """Least distance to the content, as a share of the distance to the centre, where there are no points: a camera may
 stand inside the region that all cameras see."""
-
-
 USUAL_DISTANCE = 2.0
 """Distance of a scene's points from its cameras, normalised units, from which on the rates are the usual ones.
 The network's first step moves everything by about a tenth of a unit. A street or a floor that is filmed from a quarter

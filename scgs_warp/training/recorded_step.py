@@ -41,8 +41,6 @@ CAPACITY_STEP = 1 << 16
 """Number of pairs to a multiple of which the capacity is rounded up."""
 SLOT_BYTES = 8 + 64
 """Number of bytes that a pair takes in addition to the lists of an image without gradients."""
-
-
 RETRY_AFTER = 20, 500, 500
 """Numbers of steps from each failed recording of one kind of steps to the next attempt. After one more failure, that
 kind is not recorded again. The cause may be temporary: autograd still holds the graph of an earlier step, or another

@@ -1,3 +1,5 @@
+"""The fused network against float64: values, gradients, bfloat16 products, and which networks it takes."""
+
 from __future__ import annotations
 
 import pytest

@@ -1,3 +1,5 @@
+"""Features and variation of feature planes against float64: values, gradients, borders, non-finite positions."""
+
 from __future__ import annotations
 
 import pytest
