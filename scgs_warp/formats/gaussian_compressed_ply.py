@@ -20,7 +20,7 @@ from ..storage.files import write_atomically
 from ..storage.output_folders import make_parent
 from ..types import Gaussians
 from . import smallest_three
-from .gaussian_parameters import to_arrays
+from .gaussian_parameters import REST_COLUMNS, to_arrays
 from .ply_header import ANTIALIASED_COMMENT
 
 SUFFIX = ".compressed.ply"
@@ -29,7 +29,6 @@ CHUNK = 256
 RANGES = tuple(f"{end}_{axis}" for group in ("xyz", ("scale_x", "scale_y", "scale_z"), "rgb")
                for end in ("min", "max") for axis in group)  # fmt: skip
 WORDS = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
-REST_COLUMNS = (0, 9, 24, 45)
 MAX_LOG_SCALE = 20.0
 """Largest magnitude of a logarithm of a scale."""
 REST_LIMIT = 4.0

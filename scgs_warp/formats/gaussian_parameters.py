@@ -11,6 +11,8 @@ from ..errors import UserError
 from ..gaussians import GaussianParameters
 from ..types import Gaussians
 
+REST_COLUMNS = (0, 9, 24, 45)
+"""Numbers of columns of harmonics above degree 0, for degrees 0 to 3."""
 MAX_VALUES = {"means": 1e15, "log_scales": 80.0, "quats": 1e15}
 """Largest magnitudes of parameters, so that squares and activated values stay in the range of float32. Parameters not
 listed are limited to 1e6."""

@@ -15,14 +15,12 @@ from ..storage.files import write_atomically
 from ..storage.suffixes import longest_suffix
 from ..types import Gaussians
 from .gaussian_compressed_ply import SUFFIX, is_packed, unpack
-from .gaussian_parameters import to_parameters
+from .gaussian_parameters import REST_COLUMNS, to_parameters
 from .ply_header import ANTIALIASED_COMMENT, parse_ply
 
 if TYPE_CHECKING:
     from plyfile import PlyData
 
-REST_COLUMNS = (0, 9, 24, 45)
-"""Numbers of ``f_rest_*`` columns for degrees 0 to 3."""
 OPAQUE_LOGIT = 80.0
 """Largest logit of an opacity: opaque up to rounding. It replaces infinity, which some programs write."""
 FLAT = math.log(1e-30)
