@@ -186,14 +186,17 @@ def test_points_lie_on_the_ball_at_one_moment(film):
 
 
 def test_points_have_the_colours_of_their_pixels(film):
+    """Each has that of its pixel in one of the frames of its moment."""
     found, places = found_in(film)
-    frame = next(frame for frame in film if frame.time == found.time)
-    camera, image = frame.camera, frame.image
-    local = places @ camera.viewmat[:3, :3].double().T + camera.viewmat[:3, 3].double()
-    flat = local @ camera.K.double().T
-    columns, rows = (flat[:, :2] / flat[:, 2:]).long().T
-    seen = image[rows.clamp(0, SIZE - 1), columns.clamp(0, SIZE - 1)]
-    assert float((seen - found.colors).abs().mean(1).median()) < 0.05
+    errors = []
+    for frame in (frame for frame in film if frame.time == found.time):
+        camera, image = frame.camera, frame.image
+        local = places @ camera.viewmat[:3, :3].double().T + camera.viewmat[:3, 3].double()
+        flat = local @ camera.K.double().T
+        columns, rows = (flat[:, :2] / flat[:, 2:]).long().T
+        seen = image[rows.clamp(0, SIZE - 1), columns.clamp(0, SIZE - 1)]
+        errors.append((seen - found.colors).abs().mean(1))
+    assert float(torch.stack(errors).amin(0).mean()) < 0.005
 
 
 def test_the_number_is_bounded_and_the_choice_repeatable(film):
