@@ -108,6 +108,7 @@ class PartPoser:
         self.joints = (np.array([part.joint for part in skeleton.parts]) - centre) * scale
         self.graph = _without_bridges(graph, self.owner, self._parent, self.joints, start)
         self.solver = ArapSolver(self.graph, limit=LENGTH_LIMIT)
+        self._jointed = _within_joints(self.graph, self.owner, self._parent)
         self._members = [self._with_surroundings(row) for row in range(len(skeleton.parts))]
         self._held: dict[tuple[int, ...], tuple[np.ndarray, frozenset[int]]] = {}
 
@@ -197,7 +198,7 @@ class PartPoser:
         found = self._held.get(key)
         if found is None:
             of_node = np.array(body)[self.owner]
-            rings = _rings_to_others(self.graph, of_node, FREE_RINGS + 1)
+            rings = _rings_to_others(self.graph, of_node, self._jointed, FREE_RINGS + 1)
             held, short = np.zeros(len(of_node), bool), set()
             for label in set(body):
                 own = of_node == label
@@ -231,13 +232,26 @@ def _goal(nodes: np.ndarray, motion: Rigid, now: np.ndarray) -> Goal:
     return Goal(nodes, pivot, quat, shift + rotate(quat, pivot) - pivot)
 
 
-def _rings_to_others(graph: ControlGraph, label: np.ndarray, most: int) -> np.ndarray:
-    """Return the number of edges to the nearest control point of another label, [M], at most ``most``."""
-    own = np.repeat(np.arange(len(label)), np.diff(graph.begin))
-    same = label[own] == label[graph.neighbors]
+def _within_joints(graph: ControlGraph, owner: np.ndarray, parent: Sequence[int]) -> np.ndarray:
+    """Return which neighbours belong to the same part or to one with a common joint, [2 E] bool in the order of
+    ``graph.neighbors``."""
+    above, a, b = np.array(parent), np.repeat(owner, np.diff(graph.begin)), owner[graph.neighbors]
+    return (a == b) | (above[a] == b) | (above[b] == a)
+
+
+def _rings_to_others(graph: ControlGraph, label: np.ndarray, jointed: np.ndarray, most: int) -> np.ndarray:
+    """Return the number of edges to the nearest control point of another label, [M], at most ``most``.
+
+    Args:
+        jointed: [2 E] bool, edges that count, in the order of ``graph.neighbors``. An edge that bridges a gap, because
+            without it a piece would be connected to nothing, bends no joint.
+    """
+    own = np.repeat(np.arange(len(label)), np.diff(graph.begin))[jointed]
+    other = graph.neighbors[jointed]
+    same = label[own] == label[other]
     rings = np.full(len(label), most, np.int64)
     rings[own[~same]] = 1
-    own, other = own[same], graph.neighbors[same]
+    own, other = own[same], other[same]
     for ring in range(2, most):
         near = own[rings[other] == ring - 1]
         rings[near] = np.minimum(rings[near], ring)

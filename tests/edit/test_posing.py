@@ -7,13 +7,14 @@ import dataclasses
 import numpy as np
 import pytest
 import torch
+from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components, shortest_path
 
 from helpers.edit_scenes import furthest
 from scgs_warp.data.synthetic.figure_motion import bone_transforms
 from scgs_warp.edit import EditSession
 from scgs_warp.edit.handles import STAY
-from scgs_warp.edit.part_pose import FREE_RINGS, INNER_STIFFNESS, PartMove, _rings_to_others
+from scgs_warp.edit.part_pose import FREE_RINGS, INNER_STIFFNESS, PartMove, PartPoser, _rings_to_others
 from scgs_warp.edit.rotations import from_axis, logarithm, rigid_fit, rotate, to_matrix
 from scgs_warp.edit.skeleton import Part, Skeleton
 from scgs_warp.errors import UserError
@@ -247,7 +248,7 @@ def test_a_part_between_two_others_keeps_its_turn(session, tips):
 def test_rings_are_numbers_of_edges(session):
     graph = session.graph
     label = session.skeleton.owners() % 3
-    found = _rings_to_others(graph, label, 4)
+    found = _rings_to_others(graph, label, np.ones(len(graph.neighbors), bool), 4)
     for node in range(0, len(graph), 7):
         away = shortest_path(graph.matrix, unweighted=True, indices=node)[label != label[node]].min()
         within = [other for other in range(len(graph)) if label[other] == label[node]]
@@ -255,6 +256,27 @@ def test_rings_are_numbers_of_edges(session):
         border = [i for i, other in enumerate(within) if (label[graph.ring([other], 1),] != label[node]).any()]
         least = min((inner[i] + 1 for i in border), default=np.inf)
         assert found[node] == min(least, 4) and found[node] >= min(away, 4)
+
+
+def test_an_edge_that_bridges_a_gap_frees_nothing(session):
+    """A foot that only an edge to the other leg connects to anything: turning its leg leaves the other one alone."""
+    start, graph = session.engine.motion_at(0.0).positions, session.graph
+    own, other = (np.array(session.skeleton.part(name).nodes) for name in ("knee_left", "knee_right"))
+    foot = own[np.argsort(start[own, 2])[:4]]
+    bridge = int(foot[0]), int(other[np.linalg.norm(start[other] - start[foot[0]], axis=1).argmin()])
+    edges = [edge for edge in graph.edges.tolist() if np.isin(edge, foot).sum() != 1] + [bridge]
+    ends = np.array([*edges, *(edge[::-1] for edge in edges)])
+    matrix = csr_matrix((np.ones(len(ends)), ends.T), shape=(len(graph), len(graph)))
+    rows = {"begin": matrix.indptr, "neighbors": matrix.indices, "weights": matrix.data}
+    poser = PartPoser(session.skeleton, dataclasses.replace(graph, **rows), start, session.engine.units)
+    assert set(bridge) in map(set, poser.graph.edges.tolist())
+    session.turn("hip_left", 40, (1, 0, 0))
+    held = {}
+    for which in (session.engine.poser(session.skeleton), poser):
+        goals = which.goals(_moves(session), start, np.zeros(len(graph), bool))
+        held[which] = {node for goal in goals for node in goal.nodes.tolist()} & {*foot.tolist(), *other.tolist()}
+    plain, bridged = held.values()
+    assert {*foot.tolist(), bridge[1]} <= plain <= bridged
 
 
 def test_no_edge_of_the_poser_bridges_a_gap_and_none_is_missed(session):
