@@ -41,7 +41,8 @@ class Still(NamedTuple):
 
 def still_of(pictures: Sequence[np.ndarray]) -> Still:
     """Combine pictures [H, W, 3] uint8 RGB of one camera at different moments."""
-    stack = np.stack([_like(picture, pictures[0]) for picture in pictures])
+    levels = np.array([np.median(picture) + 1.0 for picture in pictures])
+    stack = np.stack([_scaled(*each) for each in zip(pictures, (np.median(levels) / levels).tolist())])
     median = np.median(stack, axis=0).astype(np.uint8)
     gray = cv2.cvtColor(median, cv2.COLOR_RGB2GRAY).astype(np.float32)
     often = np.zeros(gray.shape, np.float32)
@@ -55,9 +56,9 @@ def still_of(pictures: Sequence[np.ndarray]) -> Still:
     return Still(median, moves, _shift(stack[0], stack[-1], moves))
 
 
-def _like(picture: np.ndarray, first: np.ndarray) -> np.ndarray:
-    """Scale a picture to the brightness of the first one, because exposures may change."""
-    factor = float(np.median(first.astype(np.float32) + 1.0) / np.median(picture.astype(np.float32) + 1.0))
+def _scaled(picture: np.ndarray, factor: float) -> np.ndarray:
+    """Scale a picture to the usual brightness, because exposures may change. That of the first one is not usual if the
+    film begins with a black picture."""
     return (picture.astype(np.float32) * factor).clip(0, 255).astype(np.uint8)
 
 

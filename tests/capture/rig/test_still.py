@@ -1,0 +1,27 @@
+"""Still pictures of a camera, of what stands still while other things move or the light changes."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from scgs_warp.capture.rig.still import still_of
+
+COUNT = 10
+
+
+@pytest.mark.parametrize("first", [0, 255], ids=["black", "white"])
+def test_a_film_may_begin_with_a_picture_that_shows_nothing(first):
+    """All pictures were scaled to the brightness of the first one, and the still picture was black or white."""
+    scene = np.random.default_rng(0).integers(40, 200, (60, 80, 3), np.uint8)
+    still = still_of([np.full_like(scene, first), *[scene] * (COUNT - 1)])
+    assert np.abs(still.image.astype(int) - scene).max() <= 1
+    assert not still.moves.any()
+
+
+def test_exposures_may_change():
+    scene = np.random.default_rng(0).integers(40, 160, (60, 80, 3), np.uint8)
+    pictures = [(scene * factor).astype(np.uint8) for factor in np.linspace(0.7, 1.3, COUNT)]
+    still = still_of(pictures)
+    assert np.abs(still.image.astype(int) - scene).max() <= 4
+    assert not still.moves.any()
