@@ -23,6 +23,9 @@ MAX_SECONDS, MAX_RATE = 1e9, 1e6
 MIN_INSTANTS = 6
 RIG_INSTANTS = 150
 """Number of instants unless the user gives one."""
+SAME_RATE = 0.98
+"""Ratio of the times between frames, of two cameras, above which these have one rate, as 30 and 29.97 frames a
+second."""
 
 
 @dataclass(frozen=True)
@@ -142,7 +145,8 @@ def time_line(
 ) -> TimeLine:
     """Choose instants and frames.
 
-    Instants are moments of frames of the first camera, evenly spread.
+    Instants are moments of frames of the first camera, evenly spread, or of the slowest one: slower cameras than that
+    would have one frame for several instants.
 
     Args:
         names: names of the cameras, for the message.
@@ -163,8 +167,10 @@ def time_line(
         )
     low = first + (begin or 0.0)
     high = last if end is None else min(last, first + end)
-    slack = SAME_MOMENT * float(np.median(np.diff(own[0]))) if len(own[0]) > 1 else 0.0
-    reference = moments[0][(moments[0] >= low - slack) & (moments[0] <= high + slack)]
+    intervals = np.array([float(np.median(np.diff(seconds))) if len(seconds) > 1 else 0.0 for seconds in own])
+    slowest = int((intervals >= SAME_RATE * intervals.max()).argmax())
+    slack = SAME_MOMENT * intervals[slowest]
+    reference = moments[slowest][(moments[slowest] >= low - slack) & (moments[slowest] <= high + slack)]
     if len(reference) < MIN_INSTANTS:
         raise UserError(
             f"the cameras have {len(reference)} frames in common ({max(high - low, 0.0):.2f} s); give longer videos, "

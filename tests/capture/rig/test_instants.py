@@ -71,6 +71,15 @@ def test_cameras_of_different_rates_share_instants():
     assert np.abs(line.moments[1] - line.seconds).max() <= 0.5 / 50 + 1e-9
 
 
+def test_no_frame_is_used_twice_where_the_first_camera_is_the_fastest():
+    own = [np.arange(count) / rate for count, rate in ((120, 59.94), (60, 30), (50, 25))]
+    line = time_line(NAMES, [0.0, 0.0077, 0.0123], own, None)
+    assert [len(np.unique(frames)) for frames in line.frames] == [len(line.seconds)] * 3 == [50] * 3
+    alike = [np.arange(count) / rate for count, rate in ((61, 30), (60, 29.97))]
+    line = time_line(NAMES[:2], [0.0, 0.002], alike, None)
+    assert (line.moments[0] == line.seconds).all(), "rates that are alike leave the instants to the first camera"
+
+
 def test_no_time_in_common_is_said():
     own = np.arange(30) / 30
     with pytest.raises(UserError, match="b begins when a has ended"):
