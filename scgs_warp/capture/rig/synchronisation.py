@@ -19,13 +19,16 @@ LOWEST, HIGHEST = 150.0, 7000.0
 """Band of the sound that is compared, Hz: without the rumble of wind and mains, and without what codecs drop."""
 CLEAR = 8.0
 """Least ratio of the peak of a correlation to its root mean square. The largest of a million values of noise is near
-5."""
+5, that of their averaged energy below 7."""
 ALL_PAIRS = 12
 """Largest number of cameras among which all pairs are compared."""
 NEXT_CAMERAS = 5
 """Number of following cameras with which each of more cameras is compared, besides the first."""
 LEAST_OVERLAP = 1.0
 """Shortest common sound of two cameras, seconds."""
+SPREAD = 0.004
+"""Width, seconds, over which the energy of an unclear correlation is averaged. The clocks of two recorders differ by
+some 20 parts in a million, which spreads the peak of a minute of sound over a millisecond and buries it in noise."""
 ROBUST_SECONDS = 0.004
 """Disagreement of a pair's offset with the others beyond which it counts less."""
 
@@ -99,20 +102,31 @@ def _whitened(samples: np.ndarray, size: int) -> np.ndarray:
 
 def _lag(one: np.ndarray, two: np.ndarray, size: int, length_one: int, length_two: int) -> tuple[float, float]:
     """Return the delay of ``two`` against ``one`` in seconds, and the clarity of the correlation's peak."""
-    from scipy import fft
+    from scipy import fft, ndimage
 
     correlation = np.asarray(fft.irfft(np.conj(one) * two, size))
     least = int(LEAST_OVERLAP * RATE)
     lags = np.concatenate([np.arange(0, size // 2), np.arange(-size // 2, 0)])
     possible = (lags < length_two - least) & (lags > least - length_one)
-    if not possible.any():
+    if min(length_one, length_two) < least or not possible.any():
         return 0.0, 0.0
-    strength = np.where(possible, correlation, 0.0)
-    peak = int(strength.argmax())
-    if min(length_one, length_two) < least or correlation.max() > strength[peak]:
-        return 0.0, 0.0  # they match where they have too little in common
-    clarity = float(strength[peak] / max(np.sqrt(np.square(correlation[possible]).mean()), 1e-12))
+    peak, clarity = _peak(correlation, possible)
+    if clarity < CLEAR:
+        correlation = np.square(correlation, dtype=np.float64)
+        for _ in range(2):  # Twice, so that it is highest where the middle of a peak is.
+            correlation = ndimage.uniform_filter1d(correlation, round(SPREAD * RATE), mode="wrap")
+        correlation -= correlation[possible].mean()
+        peak, clarity = _peak(correlation, possible)
     return (float(lags[peak]) + _vertex(correlation, peak)) / RATE, clarity
+
+
+def _peak(values: np.ndarray, possible: np.ndarray) -> tuple[int, float]:
+    """Return the place of the largest possible value and its ratio to their root mean square, which is 0 if sounds
+    match where they have too little in common."""
+    peak = int(np.where(possible, values, 0.0).argmax())
+    if values.max() > values[peak]:
+        return peak, 0.0
+    return peak, float(values[peak] / max(np.sqrt(np.square(values[possible]).mean()), 1e-12))
 
 
 def _vertex(values: np.ndarray, peak: int) -> float:
