@@ -48,11 +48,14 @@ class Outcome(NamedTuple):
     """True if each frame was matched with each."""
     whole: bool = False
     """True if the source has no further frames of use, so that a larger --frames would pick the same."""
+    film: bool = True
+    """False for a folder of images, of which --start and --end choose no part."""
 
 
 def likely_reason(outcome: Outcome) -> str:
     """Return the likeliest cause of missing cameras, and its remedy."""
     links = outcome.links
+    part = "(--start, --end)" if outcome.film else "of the images, in a folder of its own"
     if outcome.masked > MAX_MASKED and links.features < MIN_FEATURES:
         return (
             f"masks hide {100 * outcome.masked:.0f} % of the frames: they are black where something moves, and white "
@@ -71,7 +74,7 @@ def likely_reason(outcome: Outcome) -> str:
         more = "" if outcome.whole else f"give --frames {2 * outcome.picked}, "
         return (
             f"frames that follow each other have little in common ({links.inliers} matches): {more}film more slowly, "
-            "or use a part without cuts (--start, --end)"
+            f"or use a part {'without cuts ' if outcome.film else ''}{part}"
         )
     if links.planar > MAX_PLANAR or (outcome.registered and outcome.arc < MIN_ARC):
         return f"the camera turns but hardly moves: {WALK}"
@@ -81,7 +84,8 @@ def likely_reason(outcome: Outcome) -> str:
         more = f"give --frames {2 * outcome.picked}, or " if outcome.exhaustive else "give --matching exhaustive, or "
         if outcome.exhaustive and outcome.whole:
             more = ""
-        return f"the film falls into parts that do not connect: {more}use a part (--start, --end)"
+        parts = "the film falls" if outcome.film else "the images fall"
+        return f"{parts} into parts that do not connect: {more}use a part {part}"
     return "no two frames gave a beginning: give --fov if you know it, or film with more movement"
 
 

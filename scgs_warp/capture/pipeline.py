@@ -51,6 +51,9 @@ def capture(
     """
     check(request)
     source = open_source(request.source)
+    given = [f"--{name}" for name in ("start", "end") if getattr(request, name) is not None]
+    if given and not source.video:
+        raise UserError(f"{given[0]}: is for a video, but {request.source} is a folder; give one of the images to use")
     if request.masks not in ("auto", "none"):
         open_source(Path(request.masks))
     with disk_errors(folder):
@@ -186,7 +189,8 @@ def _solve(
     registered, arc = (len(solved.places), solved.arc) if solved else (0, 0.0)
     exhaustive = len(chosen) == count * (count - 1) // 2
     whole = frames.seen <= (request.frames or (VIDEO_FRAMES if source.video else frames.seen))
-    return Outcome(count, registered, arc, features.links(database, frame_files), masked, exhaustive, whole), solved
+    links = features.links(database, frame_files)
+    return Outcome(count, registered, arc, links, masked, exhaustive, whole, source.video), solved
 
 
 def _share(journal: Journal) -> float:

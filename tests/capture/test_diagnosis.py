@@ -30,6 +30,9 @@ def test_the_likeliest_reason_is_given():
     ):
         assert "--frames" not in (said := likely_reason(alone)) and "part" in said, "there are no more frames"
     assert "--matching" in likely_reason(Outcome(50, 20, 9, LINKS, 0.1, False, True))
+    for links in (LINKS, Links(2000, 12, 0.5, 0.2)):
+        images = likely_reason(Outcome(50, 20, 9, links, 0.1, film=False))
+        assert "part of the images" in images and "--start" not in images and "the film" not in images
     line = too_few("out", Outcome(50, 20, 9, LINKS, 0.1))
     assert line.startswith("out: 20 of 50 frames registered") and "--least 0.4 " in line
     assert "--least" not in too_few("out", Outcome(50, 0, 0, LINKS, 0.1))

@@ -295,6 +295,15 @@ def test_images_that_have_nothing_in_common(tmp_path):
     assert not (tmp_path / "out/transforms.json").exists()
 
 
+@pytest.mark.parametrize("option", ["start", "end"])
+def test_images_have_no_seconds_to_choose_from(tmp_path, option):
+    """The options were taken, and all images used."""
+    write_png(tmp_path / "1.png", noise(0))
+    with pytest.raises(UserError, match=f"--{option}: is for a video, but .* is a folder"):
+        run(tmp_path, tmp_path / "out", **{option: 2.0})
+    assert not (tmp_path / "out").exists()
+
+
 def test_a_full_disk_is_said_and_work_goes_on(tmp_path):
     (tmp_path / "images").mkdir()
     for index in range(7):
