@@ -114,7 +114,7 @@ def _lag(one: np.ndarray, two: np.ndarray, size: int, length_one: int, length_tw
     if clarity < CLEAR:
         correlation = np.square(correlation, dtype=np.float64)
         for _ in range(2):  # Twice, so that it is highest where the middle of a peak is.
-            correlation = ndimage.uniform_filter1d(correlation, round(SPREAD * RATE), mode="wrap")
+            correlation = np.asarray(ndimage.uniform_filter1d(correlation, round(SPREAD * RATE), mode="wrap"))
         correlation -= correlation[possible].mean()
         peak, clarity = _peak(correlation, possible)
     return (float(lags[peak]) + _vertex(correlation, peak)) / RATE, clarity
