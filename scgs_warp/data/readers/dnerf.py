@@ -40,6 +40,8 @@ from .transforms_images import find_images
 
 POINTS = "points3d.ply"
 """Points of films of rigs that are converted to this layout."""
+NUMBER = re.compile(r"([0-9]{1,9})(?:\.[A-Za-z]+)?$")
+"""The number at the end of the name of an image."""
 LEAST_COLOR = 0.02
 """Largest difference of random points' colours."""
 
@@ -142,9 +144,13 @@ def _times(folder: Path, path: Path, entries: list[dict[str, Any]]) -> Times:
     paths = [transforms_path(folder, split) for split in ("train", "test", "val") if _is_used(folder, split)]
     others = {other: read_transforms(other)["frames"] for other in paths if other != path}
     elsewhere = [entry for frames in others.values() for entry in frames]
+    if any(entry.get("time") is not None for entry in [*entries, *elsewhere]):
+        return read_times(path, entries, elsewhere)
     if _is_animation(others.get(transforms_path(folder, "train"), entries), [entries, *others.values()]):
         return Times(_numbers_as_times(entries, [*entries, *elsewhere]), ())
-    if not any(entry.get("time") is not None for entry in entries) and _of_several_cameras(entries):
+    if others and _is_numbered([*entries, *elsewhere]):
+        return Times(_numbers_as_times(entries, [*entries, *elsewhere]), ())
+    if _is_numbered(entries) or _of_several_cameras(entries):
         moments = moments_of([Path(entry["file_path"]) for entry in entries])
         return Times([moment / max(*moments, 1) for moment in moments], ())
     return read_times(path, entries, elsewhere)
@@ -157,13 +163,21 @@ def _of_several_cameras(entries: list[dict[str, Any]]) -> bool:
     return len(paths) == len(names) and 2 * len({path.stem for path in paths}) <= len({*paths})
 
 
+def _is_numbered(entries: list[dict[str, Any]]) -> bool:
+    """Return whether the images have names that differ in their numbers alone, and no number twice, as those of one
+    film have, in whatever order and in however many files they are listed."""
+    names = [NUMBER.sub("", str(entry.get("file_path"))) for entry in entries]
+    numbers = {_number(entry) for entry in entries}
+    return len(set(names)) == 1 and None not in numbers and 1 < len(numbers) == len(entries)
+
+
 def _is_animation(training: list[dict[str, Any]], files: list[list[dict[str, Any]]]) -> bool:
     """Return whether frames without times are of one animation, whose numbers their names tell: each file lists the
     frames of ``training``, and further ones between them or beyond by less than their largest step. Of other scenes,
     each file numbers its own views from the first on."""
     frames = [entry for entries in files for entry in entries]
     numbers, trained = [_number(entry) for entry in frames], sorted({_number(entry) or 0 for entry in training})
-    if len(files) < 2 or len(trained) < 2 or None in numbers or any(entry.get("time") is not None for entry in frames):
+    if len(files) < 2 or len(trained) < 2 or None in numbers:
         return False
     step = max(later - earlier for earlier, later in pairwise(trained))
     within = all(trained[0] - step < (number or 0) < trained[-1] + step for number in numbers)
@@ -173,7 +187,7 @@ def _is_animation(training: list[dict[str, Any]], files: list[list[dict[str, Any
 def _number(entry: dict[str, Any]) -> int | None:
     """Return the number at the end of the name of a frame's image; None without one."""
     name = entry.get("file_path")
-    match = re.search(r"([0-9]{1,9})(?:\.[A-Za-z]+)?$", name) if isinstance(name, str) else None
+    match = NUMBER.search(name) if isinstance(name, str) else None
     return None if match is None else int(match[1])
 
 

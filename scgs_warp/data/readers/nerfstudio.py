@@ -1,9 +1,10 @@
 """Reader of the nerfstudio layout: one ``transforms.json`` for all frames, with intrinsics, poses and optional points.
 
 ``fl_x, fl_y, cx, cy, w, h`` (pixels; for all frames or in each), per frame ``file_path``, ``transform_matrix``
-(camera-to-world, OpenGL), ``time`` in [0, 1] or else ``timestamp``, ``mask_path`` and ``depth_file_path``
-(``depth_maps``), which instant-ngp calls ``depth_path``, with ``integer_depth_scale`` as its unit; ``ply_file_path``,
-sparse points in the frame of the poses, without which those of a COLMAP model beside it count (``model_points``);
+(camera-to-world, OpenGL), ``time`` in [0, 1] or else ``timestep_index`` or ``timestamp``, ``mask_path`` and
+``depth_file_path`` (``depth_maps``), which instant-ngp calls ``depth_path``, with ``integer_depth_scale`` as its unit;
+``ply_file_path``, sparse points in the frame of the poses, without which those of a COLMAP model beside it count
+(``model_points``);
 ``train_filenames``, ``val_filenames``, ``test_filenames``; ``camera_model`` and ``k1`` ... ``k6, p1, p2``, or
 ``distortion_params``, for all frames or in each (images with distortion are undistorted).
 Layout: Tancik et al., Nerfstudio, SIGGRAPH 2023.
@@ -56,11 +57,10 @@ def recognises(folder: Path) -> bool:
 def read(folder: Path, split: str, options: ReadOptions) -> Dataset:
     """Read one split.
 
-    Frames without times have those of ``timestamp``, if they are of one camera, or are evenly spaced in the order of
-    their names (9 before 10). Without lists of files, every eighth frame is held out for ``test`` and ``val`` alike. If
-    only one of the lists for ``test`` and ``val`` is present and not empty, it serves for both splits. A frame's mask
-    is False where ``mask_path`` is black and on the borders of undistorted images. The camera of a frame is the folder
-    of its image.
+    Frames without times are evenly spaced in the order of their names (9 before 10). Without lists of files, every
+    eighth frame is held out for ``test`` and ``val`` alike. If only one of the lists for ``test`` and ``val`` is present
+    and not empty, it serves for both splits. A frame's mask is False where ``mask_path`` is black and on the borders of
+    undistorted images. The camera of a frame is the folder of its image.
 
     Raises:
         UserError: the data is invalid; one line names the file, the field and the remedy.
@@ -159,9 +159,6 @@ def _without_depth(path: Path, named: int, records: list[FrameRecord]) -> list[s
 def _times(path: Path, entries: list[dict[str, Any]], files: list[Path]) -> Times:
     if any(entry.get("time") is not None for entry in entries):
         return read_times(path, entries)
-    stamps = [as_number(entry.get("timestamp")) for entry in entries]
-    if None not in stamps and len(set(stamps)) > 1 and len({file.parent for file in files}) == 1:
-        return read_times(path, [{"time": stamp} for stamp in stamps])
     moments = moments_of(files)
     last = max(len(set(moments)) - 1, 1)
     return Times([moment / last for moment in moments], ())

@@ -6,7 +6,7 @@ Poses are camera-to-world, OpenGL (x right, y up, z backward), as NeRF's Blender
 from __future__ import annotations
 
 import math
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -31,6 +31,9 @@ FISHEYES = ("OPENCV_FISHEYE", "FISHEYE", "SIMPLE_FISHEYE", "SIMPLE_RADIAL_FISHEY
 PRISM, PRISM_COUNT = "FISHEYE624", 12
 """nerfstudio's name of the lens of Project Aria, and the number of its parameters in ``distortion_params``: those of
 COLMAP's RAD_TAN_THIN_PRISM_FISHEYE."""
+STEP, STAMP = "timestep_index", "timestamp"
+"""Fields of a frame that tell its time: the number of the instant, which the cameras of NeRSemble's heads share, and
+the clock of NeRFCapture."""
 MOST_SCALE = 1e6
 """Largest scale of a camera that is left out, and the inverse of the smallest one."""
 CORNER = 0.95
@@ -46,13 +49,26 @@ def read_transforms(path: Path) -> dict[str, Any]:
     for index, entry in enumerate(frames):
         if not isinstance(entry, dict):
             raise UserError(f"{path}: frames[{index}] is not an object; give file_path and transform_matrix")
-    given = {**content, "frames": [_given(entry) for entry in frames]}
+    given = {**content, "frames": _timed([_given(entry) for entry in frames])}
     return _given(given)
 
 
 def _given(fields: dict[str, Any]) -> dict[str, Any]:
     """Leave out fields without a value, which exporters write as null."""
     return {key: value for key, value in fields.items() if value is not None}
+
+
+def _timed(frames: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Return frames that have no ``time`` with that of another field, if all have it. The clocks of several cameras,
+    whose images are in several folders, are not compared."""
+    names = [frame.get("file_path") for frame in frames]
+    folders = {PurePosixPath(name.replace("\\", "/")).parent for name in names if isinstance(name, str)}
+    for key in (STEP, STAMP) if len(folders) == 1 else (STEP,):
+        values = [as_number(frame.get(key)) for frame in frames]
+        telling = key == STEP or len(set(values)) > 1 or len(values) == 1
+        if telling and None not in values and all(frame.get("time") is None for frame in frames):
+            return [{**frame, "time": value} for frame, value in zip(frames, values)]
+    return frames
 
 
 def read_pose(path: Path, index: int, entry: dict[str, Any]) -> np.ndarray:

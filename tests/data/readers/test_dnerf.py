@@ -157,6 +157,39 @@ def test_files_that_number_their_own_views_keep_the_times_of_their_order(tmp_pat
         assert times == pytest.approx(np.linspace(0.0, 1.0, len(numbers)).tolist(), abs=1e-6)
 
 
+def test_frames_of_one_film_have_the_times_of_their_numbers(tmp_path):
+    """A film without times, split over two files, whose frames are listed in the order in which a program ended."""
+    held = range(5, 40, 8)
+    write_animation(tmp_path, range(40), held, "images/{1}.png")
+    edit(tmp_path, lambda content: content.update(frames=[f for i, f in enumerate(content["frames"]) if i not in held]))
+    edit(tmp_path, lambda content: content["frames"].reverse())
+    for split in ("train", "test"):
+        for frame in load(tmp_path, split):
+            assert frame.time == pytest.approx(int(frame.name) / 39, abs=1e-6)
+    (tmp_path / "transforms_test.json").unlink()
+    ranks = {str(number): rank for rank, number in enumerate(n for n in range(40) if n not in held)}
+    for frame in load(tmp_path):
+        assert frame.time == pytest.approx(ranks[frame.name] / 34, abs=1e-6)
+
+
+@pytest.mark.parametrize(("key", "factor"), [("timestep_index", 1), ("timestamp", 0.04)])
+def test_other_fields_that_tell_the_time(tmp_path, key, factor):
+    """NeRSemble's heads: 16 cameras, whose images are in one folder, share each timestep. NeRFCapture has a clock."""
+    write_scene(tmp_path, frames=6)
+
+    def change(content):
+        for index, entry in enumerate(content["frames"]):
+            del entry["time"]
+            entry[key] = 7 + index // 2 * factor
+
+    edit(tmp_path, change)
+    test = json.loads((tmp_path / "transforms_train.json").read_text())
+    test["frames"] = test["frames"][2:3]
+    (tmp_path / "transforms_test.json").write_text(json.dumps(test))
+    assert load(tmp_path).times.tolist() == pytest.approx([0.0, 0.0, 0.5, 0.5, 1.0, 1.0])
+    assert load(tmp_path, "test").times.tolist() == pytest.approx([0.5])
+
+
 def test_held_out_frames_that_are_trained_on_are_noted(tmp_path):
     write_scene(tmp_path / "s")
     test = tmp_path / "s/transforms_test.json"
