@@ -52,6 +52,8 @@ class FrameRecord:
     """Whether pixels of the image that are not opaque are not valid, instead of transparent."""
     covisible: Path | None = None
     """Mask of what training images show as well; None without one."""
+    mask_excludes: bool = False
+    """Whether the mask is black where the frame is valid instead."""
 
     def anchored(self) -> FrameRecord:
         """Return the record with absolute paths, which stay valid if the program changes its directory."""
@@ -155,7 +157,7 @@ def with_points(data: Dataset, points: np.ndarray | None, colors: np.ndarray | N
 
 
 def _decode(record: FrameRecord, options: ReadOptions) -> Decoded:
-    own = record.mask, record.states_size, record.masked_by_alpha
+    own = record.mask, record.states_size, record.masked_by_alpha, record.mask_excludes
     return read_image(record.file, options, record.lens, *own)
 
 

@@ -34,6 +34,8 @@ class DepthFile(NamedTuple):
     path: Path
     unit: float
     """Factor on the values of the file."""
+    whole: bool = False
+    """Whether maps of 8 bits, which hold whole numbers up to 255, count as depth."""
 
 
 def read_depth_map(file: DepthFile, size: tuple[int, int], lens: Lens | None = None) -> Tensor:
@@ -50,7 +52,7 @@ def read_depth_map(file: DepthFile, size: tuple[int, int], lens: Lens | None = N
     values = _values(path)
     if values.ndim == 3 and values.size and (values.shape[2] == 1 or (values == values[..., :1]).all()):
         values = values[..., 0]
-    if values.ndim != 2 or not values.size or values.dtype == np.uint8:
+    if values.ndim != 2 or not values.size or (values.dtype == np.uint8 and not file.whole):
         raise UserError(f"{path}: is no depth map of one number per pixel; {REMEDY}")
     height, width = values.shape
     if not has_proportions((width, height), size):

@@ -25,7 +25,7 @@ from ..storage.safe_paths import is_regular
 from .borders import reduce_mask
 from .cache import ImageCache, Pixels
 from .lens import Lens, undistort, valid_pixels
-from .mask_files import by_alpha, classes_of, is_in_alpha
+from .mask_files import by_alpha, marked
 from .orientation import TAG, UPRIGHT, read_orientation, swaps_sides, upright
 
 RESAMPLES = ("area", "bicubic")
@@ -152,6 +152,7 @@ def read_image(
     mask_path: Path | None = None,
     states_size: bool = True,
     masked_by_alpha: bool = False,
+    mask_excludes: bool = False,
 ) -> Decoded:
     """Decode one file, undistort it, reduce it, and composite it on the background once.
 
@@ -164,6 +165,7 @@ def read_image(
         mask_path: an image that is black where the frame is not valid, and not black everywhere.
         states_size: whether the camera states the size of its images.
         masked_by_alpha: whether pixels that are not opaque are not valid, instead of transparent.
+        mask_excludes: whether the mask is black where the frame is valid instead.
 
     Raises:
         UserError: a file is missing or does not decode, or the mask has another size than the image.
@@ -171,7 +173,7 @@ def read_image(
     pixels, lens = _as_the_camera_sees(path, lens_of, states_size)
     height, width = pixels.shape[:2]
     size = reduced_size(width, height, options.downscale, path)
-    mask = None if mask_path is None else read_mask(mask_path, path, (width, height))
+    mask = None if mask_path is None else read_mask(mask_path, path, (width, height), mask_excludes)
     if masked_by_alpha:
         pixels, mask = by_alpha(pixels, mask, OPAQUE)
     if lens.distorted:
@@ -220,32 +222,26 @@ def _as_the_camera_sees(
         return upright(pixels, orientation), lens
 
 
-def read_mask(path: Path, image: Path, size: tuple[int, int]) -> np.ndarray:
-    """Read a mask: [H, W] bool, True where it is not black. ``size``: (width, height) of its image.
+def read_mask(path: Path, image: Path, size: tuple[int, int], excludes: bool = False) -> np.ndarray:
+    """Read a mask: [H, W] bool, True where it is not black or, if it ``excludes``, where it is black. ``size``: (width,
+    height) of its image.
 
     Raises:
-        UserError: the file is missing or does not decode, is all black, has another size, or may mean either.
+        UserError: the file is missing or does not decode, leaves no pixel, has another size, or may mean either.
     """
-    pixels = decode(path)
-    colors, alphas = pixels[..., :3], pixels[..., 3:]
-    white = float(np.iinfo(pixels.dtype).max)
-    if alphas.size and is_in_alpha(path, _range(colors), _range(alphas), white):
-        mask = alphas[..., 0] > 0
-    else:
-        classes = None if alphas.size else classes_of(path)
-        mask = (colors.max(axis=2) if classes is None else classes) > 0
+    mask = marked(path, decode(path))
+    if excludes:
+        mask = ~mask
     if not mask.any():
-        raise UserError(f"{path}: the mask is all black, so no pixel is valid; drop the frame")
+        raise UserError(
+            f"{path}: the mask is all {'white' if excludes else 'black'}, so no pixel is valid; drop the frame"
+        )
     if mask.shape[::-1] != size:
         raise UserError(
             f"{image}: is {size_text(size)}, but its mask is {size_text(mask.shape[::-1])}; "
             "give the mask the image's size"
         )
     return mask
-
-
-def _range(values: np.ndarray) -> tuple[float, float]:
-    return float(values.min()), float(values.max())
 
 
 def is_transparent(pixels: np.ndarray) -> bool:

@@ -33,6 +33,24 @@ def classes_of(path: Path) -> np.ndarray | None:
     return classes if used[0] == 0 and len(used) > 1 and not tells_apart else None
 
 
+def marked(path: Path, pixels: np.ndarray) -> np.ndarray:
+    """Return [H, W] bool, True where a mask with the pixels [H, W, 3 or 4] is not black, by whatever it means.
+
+    Raises:
+        UserError: it may mean either.
+    """
+    colors, alphas = pixels[..., :3], pixels[..., 3:]
+    white = float(np.iinfo(pixels.dtype).max)
+    if alphas.size and is_in_alpha(path, _range(colors), _range(alphas), white):
+        return alphas[..., 0] > 0
+    classes = None if alphas.size else classes_of(path)
+    return (colors.max(axis=2) if classes is None else classes) > 0
+
+
+def _range(values: np.ndarray) -> Range:
+    return float(values.min()), float(values.max())
+
+
 def by_alpha(pixels: np.ndarray, mask: np.ndarray | None, opaque: float) -> tuple[np.ndarray, np.ndarray | None]:
     """Take alpha from the pixels [H, W, 3 or 4] of an image into its mask [H, W], None if every pixel is valid.
 

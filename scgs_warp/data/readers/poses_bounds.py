@@ -3,8 +3,9 @@
 ``poses_bounds.npy [C, 17]``: rows of 3 x 5, the camera-to-world rotation in columns (down, right, backwards),
 position, and (height, width, focal length) in pixels; nearest and farthest depth. Row c belongs to the c-th camera in
 the order of names: ``cam00/images/0000.png``, ``cam00/0000.png`` or ``frames/cam00/0000.png``. For a film of one camera
-that moves, row c belongs to the c-th image in ``images``. Layouts: Mildenhall et al., LLFF, 2019; Li et al., Neural
-Scene Flow Fields, CVPR 2021; Li et al., Neural 3D Video Synthesis, CVPR 2022.
+that moves, row c belongs to the c-th image in ``images``; films of operations have more (``surgical``). Layouts:
+Mildenhall et al., LLFF, 2019; Li et al., Neural Scene Flow Fields, CVPR 2021; Li et al., Neural 3D Video Synthesis,
+CVPR 2022.
 """
 
 from __future__ import annotations
@@ -23,6 +24,8 @@ from ...storage.numpy_files import read_npy
 from ..assemble import FrameRecord, assemble, with_points
 from ..choice import choose, of_cameras
 from ..dataset import Dataset
+from ..depth_maps import DepthFile
+from ..depth_points import points_of_depth
 from ..held_out import held_out
 from ..images import ReadOptions, size_text
 from ..lens import Lens
@@ -30,6 +33,7 @@ from ..natural_order import by_name, natural
 from ..points import read_points
 from .colmap_images import reduced_folders
 from .colmap_model import find_model
+from .surgical import as_llff, find_surgical
 from .transforms import IMAGE_SUFFIXES
 
 FILE = "poses_bounds.npy"
@@ -110,6 +114,8 @@ def _film(folder: Path, count: int) -> list[Path]:
 def _read_film(folder: Path, files: list[Path], rows: np.ndarray, split: str, options: ReadOptions) -> Dataset:
     """Read a film of one camera: the views of the other cameras are held out or, without these, every eighth image.
     Times are evenly spaced in the order of names."""
+    surgical = find_surgical(folder, len(files))
+    rows = rows if surgical is None else as_llff(rows)
     path, ranks = folder / FILE, {index: rank for rank, index in enumerate(by_name(files))}
     times = [ranks[index] / (len(files) - 1) for index in range(len(files))]
     choice = choose(path, files, times, options, ["images"] * len(files))
@@ -118,7 +124,11 @@ def _read_film(folder: Path, files: list[Path], rows: np.ndarray, split: str, op
     def record(file: Path, camera: int, index: int, name: str) -> FrameRecord:
         pose = rows[camera, :15].reshape(3, 5)
         lens = partial(row_lens, path, camera, pose[:, 4])
-        return FrameRecord(file, row_viewmat(path, camera, pose), choice.times[index], lens, name)
+        found = FrameRecord(file, row_viewmat(path, camera, pose), choice.times[index], lens, name)
+        if surgical is None:
+            return found
+        depth = DepthFile(surgical.depth[index], 1.0, whole=True)
+        return replace(found, mask=surgical.masks[index], mask_excludes=True, depth=depth)
 
     views = _other_views(folder, len(files))
     if views and split != "train":
@@ -129,7 +139,8 @@ def _read_film(folder: Path, files: list[Path], rows: np.ndarray, split: str, op
         records = [record(files[index], index, index, files[index].stem) for index in chosen]
     data = assemble(records, options, folder=folder, split=split, notes=choice.notes)
     data.bounds = _bounds(rows[choice.indices, 15:])
-    return data
+    points = points_of_depth(data) if surgical is not None and split == "train" else None
+    return data if points is None else with_points(data, *points)
 
 
 class _View(NamedTuple):
