@@ -187,3 +187,5 @@ def _below(folder: Path) -> Iterator[Path]:
                 return
             yield inner
         level = found
+    if (folder / "0000.npz").is_file():
+        return "Uni4D"

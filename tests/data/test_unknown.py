@@ -98,6 +98,7 @@ def test_a_file_of_cameras_under_another_name(tmp_path):
         (["camera/000000.npz", "color/000000.png"], "CUT3R"),
         (["camera_poses.txt", "results_output/frame_0.npz"], "DA3-Streaming"),
         (["pose/film.npz", "rgb/film.mp4", "intrinsics/film.npz"], "ViPE"),
+        (["0000.npz", "0001.npz", "fused_4d.npz"], "Uni4D"),
     ],
 )
 def test_exports_that_capture_reads(tmp_path, files, program):

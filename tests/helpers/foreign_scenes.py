@@ -157,6 +157,19 @@ def write_streaming(folder: Path) -> Path:
     return folder
 
 
+def write_uni4d(folder: Path) -> Path:
+    """With the file of the fused points beside the frames."""
+    made = wall()
+    folder.mkdir(parents=True)
+    for index, viewmat in enumerate(made.viewmats):
+        pose = np.linalg.inv(viewmat).astype(np.float32)
+        view = {"R": pose[:3, :3], "t": pose[:3, 3:], "K": K.astype(np.float32)}
+        disparity = (1.0 / made.depths[index]).astype(np.float32)
+        np.savez_compressed(folder / f"{index:04d}.npz", img=made.images[index], disp=disparity, **view)
+    np.savez_compressed(folder / "fused_4d.npz", static_points=np.zeros((4, 3)), Ks=np.tile(K, (COUNT, 1, 1)))
+    return folder
+
+
 def write_monst3r(folder: Path) -> Path:
     made = wall()
     folder.mkdir(parents=True, exist_ok=True)
@@ -266,6 +279,7 @@ WRITERS = {
     "ViPE": write_vipe,
     "CUT3R": write_cut3r,
     "DA3-Streaming": write_streaming,
+    "Uni4D": write_uni4d,
     "Polycam": write_polycam,
     "Record3D": write_record3d,
     "3D Scanner App": write_scanner,

@@ -1,10 +1,12 @@
-"""Folders of networks that write a file for each frame: CUT3R's, and those of Depth Anything 3's streaming program.
+"""Folders of networks that write a file for each frame: CUT3R's, Uni4D's, and those of Depth Anything 3's streaming
+program.
 
 CUT3R: ``camera/000000.npz`` with ``pose [4, 4]``, camera-to-world, and ``intrinsics [3, 3]``; ``color/000000.png``;
 ``depth/000000.npy [H, W]`` and ``conf/000000.npy [H, W]``. DA3-Streaming: ``results_output/frame_0.npz`` with ``image
 [H, W, 3]`` bytes, ``depth`` and ``conf [H, W]`` and ``intrinsics [3, 3]``; a row of 16 numbers for each frame in
-``camera_poses.txt``, the camera-to-world matrix. Cameras are OpenCV's.
-Layouts: Wang et al., CUT3R, CVPR 2025; Lin et al., Depth Anything 3, 2025.
+``camera_poses.txt``, the camera-to-world matrix. Uni4D: ``0000.npz`` with ``img [H, W, 3]`` bytes, ``disp [H, W]``, the
+inverse of the depth, ``K [3, 3]``, and ``R [3, 3]`` and ``t [3]``, camera-to-world. Cameras are OpenCV's.
+Layouts: Wang et al., CUT3R, CVPR 2025; Lin et al., Depth Anything 3, 2025; Yao et al., Uni4D, CVPR 2025.
 """
 
 from __future__ import annotations
@@ -24,6 +26,8 @@ from .scene import ImportedFrame, ImportedScene, intrinsics, rigid, surer
 from .stacks import SMALLEST, members
 
 POSES, RESULTS = "camera_poses.txt", "results_output"
+UNI4D = {"img", "disp", "K", "R", "t"}
+"""Arrays of a frame of Uni4D."""
 
 
 def is_cut3r(path: Path) -> bool:
@@ -78,6 +82,30 @@ def read_streaming(path: Path) -> ImportedScene:
     return ImportedScene("DA3-Streaming", frames, gravity=False)
 
 
+def is_uni4d(path: Path) -> bool:
+    """Return whether the folder is an output of Uni4D."""
+    files = [file for file in _files(path) if file.stem.isdecimal()]
+    return bool(files) and UNI4D <= members(files[0])
+
+
+def read_uni4d(path: Path) -> ImportedScene:
+    """Read an output of Uni4D; other files, such as that of the fused points, do not count.
+
+    Raises:
+        UserError: a file is damaged or does not fit; one line names it.
+    """
+    frames = []
+    for index, file in enumerate(file for file in _files(path) if file.stem.isdecimal()):
+        rotation, position = read_npy(file, "R"), read_npy(file, "t")
+        if rotation.shape != (3, 3) or position.size != 3:
+            raise UserError(f"{file}: R and t are no pose of 3 x 3 and 3 numbers; export the scene again")
+        pose = rigid(np.column_stack([rotation, position.ravel()]), f"{file}: R and t")
+        K = intrinsics(read_npy(file, "K"), f"{file}: K")
+        load = partial(_inverse_of, file)
+        frames.append(ImportedFrame(partial(_saved_image, file, "img"), np.linalg.inv(pose), K, float(index), load))
+    return ImportedScene("Uni4D", frames, gravity=False)
+
+
 def _files(folder: Path) -> list[Path]:
     return sorted(filter(is_shown, folder.glob("*.npz")), key=lambda file: natural(file.name))
 
@@ -94,17 +122,24 @@ def _saved_depth(file: Path) -> np.ndarray:
     return surer(depth, read_npy(file, "conf"), f"{file}: conf") if "conf" in members(file) else depth
 
 
-def _saved_image(file: Path) -> np.ndarray:
+def _inverse_of(file: Path) -> np.ndarray:
+    """Read the depth [H, W] of a frame whose file holds its inverse."""
+    with np.errstate(divide="ignore"):  # what is infinitely far away is unknown
+        return 1.0 / read_npy(file, "disp")
+
+
+def _saved_image(file: Path, key: str = "image") -> np.ndarray:
     """Read the image [H, W, 3] uint8 of a frame that one file holds."""
-    image = read_npy(file, "image")
+    image = read_npy(file, key)
     if image.ndim != 3 or image.shape[2] != 3 or min(image.shape[:2]) < SMALLEST:
-        raise UserError(f"{file}: image is {list(image.shape)}, not [H, W, 3]; export the scene again")
+        raise UserError(f"{file}: {key} is {list(image.shape)}, not [H, W, 3]; export the scene again")
     if not (image.min() >= 0.0 and image.max() <= 255.0):  # False for NaN
-        raise UserError(f"{file}: image holds other numbers than 0 to 255; export the scene again")
+        raise UserError(f"{file}: {key} holds other numbers than 0 to 255; export the scene again")
     return np.ascontiguousarray(np.rint(image).astype(np.uint8))
 
 
 LAYOUTS: tuple[tuple[Callable[[Path], bool], Callable[[Path], ImportedScene]], ...] = (
     (is_cut3r, read_cut3r),
     (is_streaming, read_streaming),
+    (is_uni4d, read_uni4d),
 )

@@ -76,8 +76,8 @@ def read_scene(path: Path) -> ImportedScene:
     raise UserError(
         f"--poses {path}: is no scene of MegaSaM, VGGT, Depth Anything 3 or Pi3 (.npz), MonST3R "
         f"({monst3r.TRAJECTORY}), ViPE (pose, rgb), CUT3R (camera, color), DA3-Streaming ({frame_folders.POSES}), "
-        f"Polycam (keyframes), Record3D (.r3d; metadata.json, rgb), 3D Scanner App (frame_00000.json) or Stray Scanner "
-        f"({stray_scanner.TRACK}); export one of these"
+        "Uni4D (0000.npz), Polycam (keyframes), Record3D (.r3d; metadata.json, rgb), 3D Scanner App "
+        f"(frame_00000.json) or Stray Scanner ({stray_scanner.TRACK}); export one of these"
     )
 
 

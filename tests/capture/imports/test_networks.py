@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from helpers.foreign_scenes import COUNT, K, wall, write_cut3r, write_pi3, write_streaming
+from helpers.foreign_scenes import COUNT, K, wall, write_cut3r, write_pi3, write_streaming, write_uni4d
 from helpers.importing import entries, refused, silent
 from scgs_warp.capture import import_scene
 from scgs_warp.data import load
@@ -57,6 +57,20 @@ def test_cameras_of_cut3r_without_images_are_counted(tmp_path):
     assert f"1 of {COUNT} cameras have no image in color, and are left out" in made.note
     times = [entry.time for entry in entries(tmp_path / "data")]
     np.testing.assert_allclose(times, [0.0, 0.2, 0.6, 0.8, 1.0], atol=1e-6)
+
+
+def test_malformed_folders_of_uni4d(tmp_path):
+    fresh = lambda: write_uni4d(tmp_path / str(len([*tmp_path.iterdir()])))  # noqa: E731
+    for bad, message in (
+        ({"R": np.ones((3, 4))}, "0002.npz: R and t are no pose"),
+        ({"R": np.ones((3, 3))}, "0002.npz: R and t is not rigid"),
+        ({"K": np.zeros((3, 3))}, "0002.npz: K is no matrix"),
+        ({"img": np.zeros((36, 48))}, r"0002.npz: img is \[36, 48\]"),
+        ({"disp": None}, "0002.npz"),
+    ):
+        source = fresh()
+        changed(source / "0002.npz", **bad)
+        refused(source, tmp_path, message)
 
 
 def test_malformed_folders_of_cut3r(tmp_path):
