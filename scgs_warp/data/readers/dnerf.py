@@ -36,7 +36,7 @@ from .transforms import (
     read_times,
     read_transforms,
 )
-from .transforms_images import find_images
+from .transforms_images import films_of, find_images
 
 POINTS = "points3d.ply"
 """Points of films of rigs that are converted to this layout."""
@@ -65,7 +65,7 @@ def read(folder: Path, split: str, options: ReadOptions) -> Dataset:
         UserError: the data is invalid; one line names the file, the field and the remedy.
     """
     path, shared = _path(folder, split)
-    content = read_transforms(path)
+    content = _read_file(path)
     entries = content["frames"]
     poses = [read_pose(path, index, entry) for index, entry in enumerate(entries)]
     times, scaled = _times(folder, path, entries)
@@ -81,9 +81,10 @@ def read(folder: Path, split: str, options: ReadOptions) -> Dataset:
         choice = _within_training(folder, path, files, times, options)
     chosen = held_out(path, choice.indices, split) if shared else choice.indices
     smaller = note_reduced(path, {**content, **entries[chosen[0]]}, files[chosen[0]])
-    notes = [*located.notes, *scaled, *choice.notes, *smaller, *_unused(folder)]
+    notes = [*located.notes, *_of_films(path, len(entries)), *scaled, *choice.notes, *smaller, *_unused(folder)]
     if not shared and split != "train":
         notes += _of_trained(folder, path, [entries[index] for index in chosen])
+        notes += _of_unseen(folder, path, split, [times[index] for index in chosen])
     records = []
     for index in chosen:
         fields = {**content, **entries[index]}
@@ -95,6 +96,21 @@ def read(folder: Path, split: str, options: ReadOptions) -> Dataset:
         records.append(FrameRecord(*frame, states_size=states_size))
     data = assemble(records, options, folder=folder, split=split, one_size=True, notes=notes)
     return data if data.with_alpha else with_points(data, *_points(folder / POINTS))
+
+
+def _read_file(path: Path) -> dict[str, Any]:
+    """Read a file, with all images of the films of which it lists one each."""
+    content, training = read_transforms(path), transforms_path(path.parent, "train")
+    others = read_transforms(training)["frames"] if path != training and training.is_file() else []
+    return {**content, "frames": films_of(path.parent, content["frames"], others)}
+
+
+def _of_films(path: Path, count: int) -> list[str]:
+    """Return a note if a file lists one image of each film, and ``count`` are read."""
+    listed = len(read_transforms(path)["frames"])
+    if listed == count:
+        return []
+    return [f"{path}: lists one image of each of {listed} cameras; all {count} images in their folders are read"]
 
 
 def _points(path: Path) -> tuple[np.ndarray | None, np.ndarray | None]:
@@ -126,7 +142,7 @@ def _is_used(folder: Path, split: str) -> bool:
         content = read_json(path)
         if isinstance(content, dict) and content.get("frames") == []:
             return False
-        files = find_images(path, folder, read_transforms(path)["frames"]).files
+        files = find_images(path, folder, _read_file(path)["frames"]).files
     except UserError:
         return True
     return any(file.is_file() for file in files)
@@ -142,7 +158,7 @@ def _unused(folder: Path) -> list[str]:
 def _times(folder: Path, path: Path, entries: list[dict[str, Any]]) -> Times:
     """Return the times of a file's frames, on the scale of those of all splits."""
     paths = [transforms_path(folder, split) for split in ("train", "test", "val") if _is_used(folder, split)]
-    others = {other: read_transforms(other)["frames"] for other in paths if other != path}
+    others = {other: _read_file(other)["frames"] for other in paths if other != path}
     elsewhere = [entry for frames in others.values() for entry in frames]
     if any(entry.get("time") is not None for entry in [*entries, *elsewhere]):
         return read_times(path, entries, elsewhere)
@@ -203,13 +219,33 @@ def _of_trained(folder: Path, path: Path, held: list[dict[str, Any]]) -> list[st
     training = transforms_path(folder, "train")
     if not training.is_file():
         return []
-    trained = {_identity(entry) for entry in read_transforms(training)["frames"]}
+    trained = {_identity(entry) for entry in _read_file(training)["frames"]}
     count = sum(_identity(entry) in trained for entry in held)
     if count == 0:
         return []
     return [
         f"{path}: {count} of {len(held)} frames are trained on as well, so that their scores are not of held-out "
         f"views; remove {path.name} to hold out every eighth training frame"
+    ]
+
+
+def _of_unseen(folder: Path, path: Path, split: str, held: list[float]) -> list[str]:
+    """Return a note if held-out frames are before or after all times that are trained on, by more than the distance of
+    training frames: their motion can only be guessed."""
+    training = transforms_path(folder, "train")
+    if not training.is_file():
+        return []
+    trained = sorted(set(_times(folder, training, _read_file(training)["frames"]).times))
+    apart = 1.5 * max((later - earlier for earlier, later in pairwise(trained)), default=0.0)
+    count = sum(not trained[0] - apart <= time <= trained[-1] + apart for time in held)
+    if count == 0:
+        return []
+    other = {"test": "val", "val": "test"}[split]
+    more = transforms_path(folder, other) != path and _is_used(folder, other)
+    way = f"; evaluate --split {other} scores others" if more else ""
+    return [
+        f"{path}: {count} of {len(held)} frames are of times beyond those of {training.name}, so that their scores "
+        f"tell how motion goes on where nothing shows it{way}"
     ]
 
 
@@ -225,7 +261,7 @@ def _check_times(folder: Path, path: Path, entries: list[dict[str, Any]]) -> Non
     if not training.is_file():
         return
     timed, trained = (
-        any(entry.get("time") is not None for entry in each) for each in (entries, read_transforms(training)["frames"])
+        any(entry.get("time") is not None for entry in each) for each in (entries, _read_file(training)["frames"])
     )
     if timed != trained:
         lacks, has = (training, path) if timed else (path, training)
@@ -240,7 +276,7 @@ def _within_training(folder: Path, path: Path, files: list[Path], times: list[fl
     indices, scaled = list(range(len(files))), times
     if options.frames:
         training = transforms_path(folder, "train")
-        instants = choose_instants(_times(folder, training, read_transforms(training)["frames"]).times, options)
+        instants = choose_instants(_times(folder, training, _read_file(training)["frames"]).times, options)
         assert instants is not None
         indices = [index for index in indices if instants.first <= times[index] <= instants.last]
         scaled = instants.scaled(times)

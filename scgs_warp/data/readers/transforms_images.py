@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
 from typing import Any, NamedTuple
 
@@ -11,6 +12,9 @@ from ...storage.safe_paths import first_there, inside
 from ..moved_images import Move, find_move, parts_of
 from .colmap_images import reduced_folders
 from .transforms import IMAGE_SUFFIXES
+
+RARE = (".tif", ".tiff", ".bmp", ".exr")
+"""Suffixes of images that few data sets have; the decoder says which of them it does not read."""
 
 
 class FrameFiles(NamedTuple):
@@ -41,6 +45,31 @@ def find_images(path: Path, folder: Path, entries: list[dict[str, Any]]) -> Fram
             return moved
     files = [_find_image(path, folder, index, name) for index, name in enumerate(names)]
     return FrameFiles(files, entries, _other_suffixes(path, names, files))
+
+
+def films_of(
+    folder: Path, entries: list[dict[str, Any]], others: Sequence[dict[str, Any]] = ()
+) -> list[dict[str, Any]]:
+    """Return a frame for each image of a rig's films, if files list no more than the cameras, as DiVa-360's do: one
+    image of each, all of one name and without a time, in folders that hold more. Their times are the numbers in the
+    names of the images. Other frames are returned as they are.
+
+    Args:
+        others: frames of another file, with other cameras of the rig.
+    """
+    every = [PurePosixPath(str(entry.get("file_path")).replace("\\", "/")) for entry in (*entries, *others)]
+    alike = len({path.name for path in every}) == 1 < len({path.parent for path in every}) == len(every)
+    timed = any(entry.get("time") is not None for entry in (*entries, *others))
+    if timed or not alike or not every[0].stem.isdecimal():
+        return entries
+    shown: list[dict[str, Any]] = []
+    for path, entry in zip(every, entries):
+        place = _existing(folder, str(path))
+        files = [] if place is None else [file for file in place.parent.iterdir() if file.suffix == place.suffix]
+        numbered = sorted((int(file.stem), file.name) for file in files if file.stem.isdecimal())
+        for time, name in numbered or [(int(path.stem), path.name)]:
+            shown.append({**entry, "file_path": str(path.parent / name), "time": time})
+    return shown if len(shown) > len(entries) else entries
 
 
 def _moved(path: Path, folder: Path, entries: list[dict[str, Any]]) -> FrameFiles | None:
@@ -86,7 +115,7 @@ def _completed(base: Path) -> Path:
     if base.suffix.lower() in IMAGE_SUFFIXES:
         candidates = [base, *(base.with_suffix(suffix) for suffix in IMAGE_SUFFIXES)]
     else:
-        candidates = [base.with_name(base.name + suffix) for suffix in IMAGE_SUFFIXES]
+        candidates = [base.with_name(base.name + suffix) for suffix in (*IMAGE_SUFFIXES, *RARE)]
     return base if base.is_file() else first_there(candidates) or candidates[0]
 
 

@@ -53,6 +53,24 @@ def test_two_angles_of_view(tmp_path):
         load(tmp_path / "s", "train")
 
 
+@pytest.mark.parametrize("suffix", [".tif", ".bmp", ".exr"])
+def test_images_of_rare_kinds_whose_names_lack_the_suffix(tmp_path, suffix):
+    """They exist, so they are not said to be missing."""
+    images = write_scene(tmp_path, mode="RGB")
+    for index, pixels in enumerate(images):
+        file = tmp_path / f"train/r_{index:03d}.png"
+        file.rename(file.with_suffix(suffix)) if suffix == ".exr" else PillowImage.fromarray(pixels).save(
+            file.with_suffix(suffix)
+        )
+        file.unlink(missing_ok=True)
+    if suffix == ".exr":
+        (tmp_path / "train/r_000.exr").write_bytes(b"v/1\x01" + bytes(400))
+        with pytest.raises(UserError, match=r"r_000\.exr: not an image that decodes to 8 or 16 bits; save it again"):
+            load(tmp_path)
+        return
+    np.testing.assert_allclose(load(tmp_path)[0].image, images[0] / 255.0, atol=1e-6)
+
+
 def test_masks_of_frames(tmp_path):
     write_scene(tmp_path / "s")
     mask = np.full((HEIGHT, WIDTH), 255, np.uint8)
@@ -188,6 +206,21 @@ def test_other_fields_that_tell_the_time(tmp_path, key, factor):
     (tmp_path / "transforms_test.json").write_text(json.dumps(test))
     assert load(tmp_path).times.tolist() == pytest.approx([0.0, 0.0, 0.5, 0.5, 1.0, 1.0])
     assert load(tmp_path, "test").times.tolist() == pytest.approx([0.5])
+
+
+def test_held_out_times_that_training_does_not_reach_are_noted(tmp_path):
+    """VHAP's exports of heads hold out the end of the film as test, and a camera as val."""
+    write_scene(tmp_path, frames=10)
+    content = json.loads((tmp_path / "transforms_train.json").read_text())
+    for split, frames in (("train", range(7)), ("test", range(7, 10)), ("val", range(2, 8))):
+        listed = content | {"frames": [content["frames"][index] for index in frames]}
+        (tmp_path / f"transforms_{split}.json").write_text(json.dumps(listed))
+    told = "2 of 3 frames are of times beyond those of transforms_train.json"
+    assert any(
+        told in note and note.endswith("evaluate --split val scores others") for note in load(tmp_path, "test").notes
+    )
+    for split in ("train", "val"):
+        assert not any("beyond those" in note for note in load(tmp_path, split).notes)
 
 
 def test_held_out_frames_that_are_trained_on_are_noted(tmp_path):
@@ -353,3 +386,31 @@ def test_images_of_several_cameras_that_record_at_once(tmp_path):
     edit(tmp_path, change)
     (tmp_path / "transforms_test.json").unlink()
     assert sorted([*load(tmp_path).times.tolist(), *load(tmp_path, "test").times.tolist()]) == [0.0] * 3 + [1.0] * 3
+
+
+@pytest.mark.parametrize("more", [True, False])
+def test_films_of_which_one_image_is_listed(tmp_path, more):
+    """DiVa-360's files list the cameras, with the first image of each; its films are in the folders of these images."""
+    write_scene(tmp_path, frames=6)
+    for camera in range(6):
+        folder = tmp_path / f"frames_1/cam{camera:02d}"
+        folder.mkdir(parents=True)
+        for instant in range(5 if more else 1):
+            shutil.copy(tmp_path / f"train/r_{camera:03d}.png", folder / f"{instant:08d}.png")
+
+    def change(content):
+        for camera, entry in enumerate(content["frames"]):
+            entry["file_path"] = f"frames_1/cam{camera:02d}/00000000.png"
+            del entry["time"]
+
+    edit(tmp_path, change)
+    content = json.loads((tmp_path / "transforms_train.json").read_text())
+    for split, cameras in (("train", slice(1, 6)), ("test", slice(0, 1))):
+        (tmp_path / f"transforms_{split}.json").write_text(json.dumps(content | {"frames": content["frames"][cameras]}))
+    (tmp_path / "frames_1/cam00/00000004.png").unlink(missing_ok=True)
+    train, test = load(tmp_path), load(tmp_path, "test")
+    if not more:
+        assert train.times.tolist() == [0.0] * 5 and test.times.tolist() == [0.0]
+        return
+    assert train.times.tolist() == [0.0, 0.25, 0.5, 0.75, 1.0] * 5 and test.times.tolist() == [0.0, 0.25, 0.5, 0.75]
+    assert "lists one image of each of 5 cameras; all 25 images in their folders are read" in train.notes[0]
