@@ -54,6 +54,8 @@ class FrameRecord:
     """Mask of what training images show as well; None without one."""
     mask_excludes: bool = False
     """Whether the mask is black where the frame is valid instead."""
+    cut_out_by: Path | None = None
+    """Image whose brightness is the alpha of the frame; None: that of its own file."""
 
     def anchored(self) -> FrameRecord:
         """Return the record with absolute paths, which stay valid if the program changes its directory."""
@@ -157,7 +159,7 @@ def with_points(data: Dataset, points: np.ndarray | None, colors: np.ndarray | N
 
 
 def _decode(record: FrameRecord, options: ReadOptions) -> Decoded:
-    own = record.mask, record.states_size, record.masked_by_alpha, record.mask_excludes
+    own = record.mask, record.states_size, record.masked_by_alpha, record.mask_excludes, record.cut_out_by
     return read_image(record.file, options, record.lens, *own)
 
 

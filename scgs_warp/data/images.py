@@ -25,7 +25,7 @@ from ..storage.safe_paths import is_regular
 from .borders import reduce_mask
 from .cache import ImageCache, Pixels
 from .lens import Lens, undistort, valid_pixels
-from .mask_files import by_alpha, marked
+from .mask_files import by_alpha, cut_out, marked
 from .orientation import TAG, UPRIGHT, read_orientation, swaps_sides, upright
 
 RESAMPLES = ("area", "bicubic")
@@ -153,6 +153,7 @@ def read_image(
     states_size: bool = True,
     masked_by_alpha: bool = False,
     mask_excludes: bool = False,
+    cut_out_by: Path | None = None,
 ) -> Decoded:
     """Decode one file, undistort it, reduce it, and composite it on the background once.
 
@@ -166,11 +167,14 @@ def read_image(
         states_size: whether the camera states the size of its images.
         masked_by_alpha: whether pixels that are not opaque are not valid, instead of transparent.
         mask_excludes: whether the mask is black where the frame is valid instead.
+        cut_out_by: an image whose brightness is the alpha of the file.
 
     Raises:
         UserError: a file is missing or does not decode, or the mask has another size than the image.
     """
     pixels, lens = _as_the_camera_sees(path, lens_of, states_size)
+    if cut_out_by is not None:
+        pixels = cut_out(path, pixels, cut_out_by, decode(cut_out_by))
     height, width = pixels.shape[:2]
     size = reduced_size(width, height, options.downscale, path)
     mask = None if mask_path is None else read_mask(mask_path, path, (width, height), mask_excludes)

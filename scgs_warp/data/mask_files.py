@@ -5,12 +5,15 @@ from __future__ import annotations
 import struct
 from pathlib import Path
 
+import cv2
 import numpy as np
 
 from ..errors import UserError
 from ..storage.files import open_regular
 
 Range = tuple[float, float]
+MOST_DIFFERENT = 0.02
+"""Largest relative difference between the proportions of a mask that cuts out and of its image."""
 
 
 def classes_of(path: Path) -> np.ndarray | None:
@@ -49,6 +52,30 @@ def marked(path: Path, pixels: np.ndarray) -> np.ndarray:
 
 def _range(values: np.ndarray) -> Range:
     return float(values.min()), float(values.max())
+
+
+def cut_out(path: Path, pixels: np.ndarray, mask_path: Path, mask: np.ndarray) -> np.ndarray:
+    """Return the pixels [H, W, 4] of an image whose alpha is the brightness of a mask, black on the background.
+
+    Args:
+        path: the image; its pixels are [H, W, 3 or 4].
+        mask: [h, w, 3 or 4] of any size.
+
+    Raises:
+        UserError: the mask has other proportions than the image.
+    """
+    (height, width), (rows, columns) = pixels.shape[:2], mask.shape[:2]
+    if abs(columns * height / (rows * width) - 1.0) > MOST_DIFFERENT:
+        raise UserError(
+            f"{mask_path}: is {columns} x {rows} pixels, but its image {path.name} {width} x {height}; give it the "
+            "proportions of the image"
+        )
+    if (height, width) != (rows, columns):
+        mask = cv2.resize(mask, (width, height), interpolation=cv2.INTER_AREA)
+    grey, largest = mask[..., :3].max(axis=2), np.iinfo(mask.dtype).max
+    share = grey / (1.0 if grey.max() == 1 else largest)  # some programs write 0 and 1
+    alpha = np.rint(share * np.iinfo(pixels.dtype).max).astype(pixels.dtype)
+    return np.dstack([pixels[..., :3], alpha])
 
 
 def by_alpha(pixels: np.ndarray, mask: np.ndarray | None, opaque: float) -> tuple[np.ndarray, np.ndarray | None]:

@@ -2,7 +2,8 @@
 
 A row of the table holds ``name, w, h``; ``rx, ry, rz``, the camera-to-world rotation as an axis times an angle in
 radians; ``tx, ty, tz``, the camera's position in metres; ``fx, fy, px, py``, focal lengths and principal point as
-shares of width and height. Cameras are OpenCV's. ``masks/`` cuts out the actor.
+shares of width and height. Cameras are OpenCV's. ``masks/Cam001/Cam001_mask000000.png`` cuts out the actor; without
+masks, the studio is seen.
 Layout: Işık et al., HumanRF, SIGGRAPH 2023.
 """
 
@@ -36,7 +37,7 @@ def recognises(folder: Path) -> bool:
 
 def read(folder: Path, split: str, options: ReadOptions) -> Dataset:
     """Read one split: the cameras that HumanRF tests on are ``test`` and ``val``, or the first one if none of them is
-    there. Times are those in the names of images.
+    there. Times are those in the names of images. The actor is cut out if every image of the split has a mask.
 
     Raises:
         UserError: the data is invalid; one line names the file, the field and the remedy.
@@ -53,7 +54,9 @@ def read(folder: Path, split: str, options: ReadOptions) -> Dataset:
             raise UserError(f"{where} has a size or focal length that is not positive; restore the file")
         lens = Lens(row["fx"] * size[0], row["fy"] * size[1], row["px"] * size[0], row["py"] * size[1])
         files = {stem.removeprefix(f"{name}_"): file for stem, file in images_in(folder / "rgbs" / name).items()}
-        cameras.append(RigCamera(name, viewmat, partial(fitted_lens, where, lens, size), files))
+        masks = {stem.removeprefix(f"{name}_mask"): file for stem, file in images_in(folder / "masks" / name).items()}
+        cut = {instant: masks[instant.removeprefix("rgb")] for instant in files if instant.removeprefix("rgb") in masks}
+        cameras.append(RigCamera(name, viewmat, partial(fitted_lens, where, lens, size), files, cut))
     return read_rig(path, folder, cameras, split, options, held=[f"Cam{number:03d}" for number in HELD_OUT])
 
 

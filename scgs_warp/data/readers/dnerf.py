@@ -36,7 +36,7 @@ from .transforms import (
     read_times,
     read_transforms,
 )
-from .transforms_images import films_of, find_images
+from .transforms_images import films_of, find_foregrounds, find_images
 
 POINTS = "points3d.ply"
 """Points of films of rigs that are converted to this layout."""
@@ -85,15 +85,15 @@ def read(folder: Path, split: str, options: ReadOptions) -> Dataset:
     if not shared and split != "train":
         notes += _of_trained(folder, path, [entries[index] for index in chosen])
         notes += _of_unseen(folder, path, split, [times[index] for index in chosen])
-    records = []
-    for index in chosen:
+    records, cut_out = [], find_foregrounds(path, folder, entries, chosen)
+    for index, foreground in zip(chosen, cut_out):
         fields = {**content, **entries[index]}
         read_distortion(path, fields)
         lens = partial(read_lens, path, fields, index)
         states_size = "w" in fields or "h" in fields
         mask = find_mask(path, folder, index, entries[index])
         frame = (files[index], poses[index], choice.times[index], lens, files[index].stem, mask)
-        records.append(FrameRecord(*frame, states_size=states_size))
+        records.append(FrameRecord(*frame, states_size=states_size, cut_out_by=foreground))
     data = assemble(records, options, folder=folder, split=split, one_size=True, notes=notes)
     return data if data.with_alpha else with_points(data, *_points(folder / POINTS))
 

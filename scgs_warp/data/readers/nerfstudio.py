@@ -12,6 +12,7 @@ Layout: Tancik et al., Nerfstudio, SIGGRAPH 2023.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 from pathlib import Path, PurePosixPath
 from typing import Any
@@ -44,7 +45,7 @@ from .transforms import (
     read_times,
     read_transforms,
 )
-from .transforms_images import find_images
+from .transforms_images import find_foregrounds, find_images
 
 FILE = "transforms.json"
 
@@ -58,9 +59,9 @@ def read(folder: Path, split: str, options: ReadOptions) -> Dataset:
     """Read one split.
 
     Frames without times are evenly spaced in the order of their names (9 before 10). Without lists of files, every
-    eighth frame is held out for ``test`` and ``val`` alike. If only one of the lists for ``test`` and ``val`` is present
-    and not empty, it serves for both splits. A frame's mask is False where ``mask_path`` is black and on the borders of
-    undistorted images. The camera of a frame is the folder of its image.
+    eighth frame is held out for ``test`` and ``val`` alike. If only one of the lists for ``test`` and ``val`` is
+    present and not empty, it serves for both splits. A frame's mask is False where ``mask_path`` is black and on the
+    borders of undistorted images. The camera of a frame is the folder of its image.
 
     Raises:
         UserError: the data is invalid; one line names the file, the field and the remedy.
@@ -82,6 +83,8 @@ def read(folder: Path, split: str, options: ReadOptions) -> Dataset:
         _record(path, folder, {**content, "frames": entries}, index, files[index], poses[index], choice.times[index])
         for index in chosen
     ]
+    cut_out = find_foregrounds(path, folder, entries, chosen)
+    records = [replace(record, cut_out_by=mask) for record, mask in zip(records, cut_out)]
     border = video_border([files[index] for index in choice.indices], [times[index] for index in choice.indices])
     first = choice.indices[0]
     smaller = note_reduced(path, {**content, **entries[first]}, files[first])

@@ -32,6 +32,8 @@ class RigCamera(NamedTuple):
     """Function from the (width, height) of an image to its lens; raises UserError if the size does not fit."""
     files: dict[str, Path]
     """Images by the names of their instants, which are the same for all cameras."""
+    masks: dict[str, Path] | None = None
+    """Masks by the names of their instants, black on the background; None without any."""
 
 
 def read_rig(
@@ -69,6 +71,7 @@ def read_rig(
     outside = (names & set(held)) or {chosen[0].name}
     if outside == names:
         outside = {chosen[0].name}
+    cut_out, unmasked = _cut_out(folder, chosen)
     instants = sorted({instant for camera in filmed for instant in camera.files}, key=natural)
     times = dict(zip(instants, times_from_names(instants) if len(instants) > 1 else [0.0]))
     listed = [
@@ -83,10 +86,20 @@ def read_rig(
             choice.times[index],
             listed[index][0].lens,
             f"{listed[index][0].name}_{listed[index][1]}",
+            cut_out_by=(listed[index][0].masks or {}).get(listed[index][1]) if cut_out else None,
         )
         for index in choice.indices
     ]
-    return assemble(records, options, folder=folder, split=split, notes=(*lines, *choice.notes))
+    return assemble(records, options, folder=folder, split=split, notes=(*lines, *unmasked, *choice.notes))
+
+
+def _cut_out(folder: Path, cameras: Sequence[RigCamera]) -> tuple[bool, list[str]]:
+    """Return whether all images have masks that cut them out, and a note if only some have."""
+    images = sum(len(camera.files) for camera in cameras)
+    missing = sum(len(camera.files.keys() - (camera.masks or {}).keys()) for camera in cameras)
+    if missing in (0, images):
+        return missing == 0, []
+    return False, [f"{folder}: {missing} of {images} images have no mask; no image is cut out"]
 
 
 def images_in(folder: Path) -> dict[str, Path]:

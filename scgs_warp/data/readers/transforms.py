@@ -162,18 +162,18 @@ def moments_of(files: list[Path]) -> list[int]:
     return moments
 
 
-def find_mask(path: Path, folder: Path, index: int, entry: dict[str, Any]) -> Path | None:
+def find_mask(path: Path, folder: Path, index: int, entry: dict[str, Any], key: str = "mask_path") -> Path | None:
     """Return the file of a frame's mask; None if it names none.
 
     Raises:
         UserError: the name is no text, or leads out of the folder.
     """
-    mask = entry.get("mask_path")
+    mask = entry.get(key)
     if mask is None or mask == "":
         return None
     if not isinstance(mask, str):
-        raise UserError(f"{path}: frames[{index}].mask_path is not text; name the mask's file or leave it out")
-    return inside(folder, mask, f"{path}: frames[{index}].mask_path", "mask")
+        raise UserError(f"{path}: frames[{index}].{key} is not text; name the mask's file or leave it out")
+    return inside(folder, mask, f"{path}: frames[{index}].{key}", "mask")
 
 
 def read_distortion(path: Path, fields: dict[str, Any]) -> tuple[str, tuple[float, ...]]:

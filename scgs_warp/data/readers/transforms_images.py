@@ -11,10 +11,12 @@ from ...errors import UserError
 from ...storage.safe_paths import first_there, inside
 from ..moved_images import Move, find_move, parts_of
 from .colmap_images import reduced_folders
-from .transforms import IMAGE_SUFFIXES
+from .transforms import IMAGE_SUFFIXES, find_mask
 
 RARE = (".tif", ".tiff", ".bmp", ".exr")
 """Suffixes of images that few data sets have; the decoder says which of them it does not read."""
+FOREGROUND = "fg_mask_path"
+"""Field of a frame that names the mask of its foreground, as GaussianAvatars' data of NeRSemble's heads have."""
 
 
 class FrameFiles(NamedTuple):
@@ -88,7 +90,7 @@ def _moved(path: Path, folder: Path, entries: list[dict[str, Any]]) -> FrameFile
 def _with_moved_maps(entry: dict[str, Any], move: Move) -> dict[str, Any]:
     """Drop from the names of a frame's mask and depth map the folders that its image's name has lost."""
     lost, moved = parts_of(entry["file_path"])[: move.dropped], dict(entry)
-    for key in ("mask_path", "depth_file_path", "depth_path"):
+    for key in ("mask_path", FOREGROUND, "depth_file_path", "depth_path"):
         if isinstance(entry.get(key), str) and parts_of(entry[key])[: move.dropped] == lost:
             moved[key] = "/".join(parts_of(entry[key])[move.dropped :])
     return moved
@@ -128,6 +130,14 @@ def _other_suffixes(path: Path, names: list[str], files: list[Path]) -> tuple[st
         if name.suffix.lower() in IMAGE_SUFFIXES and name.suffix.lower() != file.suffix.lower()
     ]
     return (f"{path}: images of other names than listed are used, such as {other[0]}",) if other else ()
+
+
+def find_foregrounds(
+    path: Path, folder: Path, entries: list[dict[str, Any]], indices: Sequence[int]
+) -> list[Path | None]:
+    """Return the masks that cut frames out, white on the foreground; None for each frame unless all have one."""
+    masks = [find_mask(path, folder, index, entries[index], FOREGROUND) for index in indices]
+    return masks if all(mask is not None and mask.is_file() for mask in masks) else [None] * len(masks)
 
 
 def is_foreign(name: str) -> bool:

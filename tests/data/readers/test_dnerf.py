@@ -414,3 +414,25 @@ def test_films_of_which_one_image_is_listed(tmp_path, more):
         return
     assert train.times.tolist() == [0.0, 0.25, 0.5, 0.75, 1.0] * 5 and test.times.tolist() == [0.0, 0.25, 0.5, 0.75]
     assert "lists one image of each of 5 cameras; all 25 images in their folders are read" in train.notes[0]
+
+
+@pytest.mark.parametrize("kind", [np.uint8, np.uint16])
+def test_masks_of_the_foreground_cut_out(tmp_path, kind):
+    """As GaussianAvatars names them; they count only if all are there."""
+    write_scene(tmp_path, mode="RGB")
+    share = np.linspace(0.0, 1.0, WIDTH)[None].repeat(HEIGHT, 0)
+    (tmp_path / "fg_masks").mkdir()
+    for index in range(3):
+        mask = np.rint(share * np.iinfo(kind).max).astype(kind)
+        PillowImage.fromarray(mask).save(tmp_path / f"fg_masks/{index}.png")
+
+    def change(content):
+        for index, entry in enumerate(content["frames"]):
+            entry["fg_mask_path"] = f"fg_masks/{index}.png"
+
+    edit(tmp_path, change)
+    alpha = load(tmp_path)[0].alpha
+    assert alpha is not None
+    np.testing.assert_allclose(alpha, share, atol=0.003)
+    (tmp_path / "fg_masks/2.png").unlink()
+    assert not load(tmp_path).with_alpha

@@ -20,6 +20,7 @@ from helpers.rig_layouts import (
     write_multipleview,
 )
 from scgs_warp.data import load
+from scgs_warp.errors import UserError
 
 LAYOUTS = {
     "multipleview": (write_multipleview, 0, ["cam01_frame_00001", "cam01_frame_00002", "cam01_frame_00003"]),
@@ -177,3 +178,25 @@ def test_faults_are_named(tmp_path, fault):
     edit(tmp_path)
     split = "test" if fault == "other size" else "train"
     assert expected in message(tmp_path, split)
+
+
+def test_masks_of_actors_hq_cut_out(tmp_path):
+    write_actors_hq(tmp_path)
+    assert not load(tmp_path).with_alpha  # masks that are white everywhere
+    for file in tmp_path.glob("masks/*/*.png"):
+        mask = np.zeros((HEIGHT, WIDTH), np.uint8)
+        mask[:, WIDTH // 2 :] = 255
+        assert cv2.imwrite(str(file), mask)
+    for split in ("train", "test"):
+        data = load(tmp_path, split)
+        assert len(data.with_alpha) == len(data)
+        alpha = data[0].alpha
+        assert alpha is not None and not alpha[:, : WIDTH // 2].any() and alpha[:, WIDTH // 2 :].all()
+    assert cv2.imwrite(str(file), mask[:, :HEIGHT])
+    with pytest.raises(UserError, match=r"is 60 x 60 pixels, but its image Cam\S+ 80 x 60; give it the proportions"):
+        [load(tmp_path, split) for split in ("train", "test")]
+    file.unlink()
+    data = load(tmp_path)
+    assert not data.with_alpha and any(
+        "1 of 12 images have no mask; no image is cut out" in note for note in data.notes
+    )
