@@ -98,6 +98,12 @@ def of_cameras(cameras: Sequence[str], options: ReadOptions) -> list[int]:
     return [index for index, name in enumerate(cameras) if name in wanted]
 
 
+def held_camera(cameras: Sequence[str], options: ReadOptions) -> str:
+    """Return the name of the held-out camera of a rig: the one that ``--only-cameras`` names first or, if it names
+    none, the first of ``cameras``."""
+    return next(iter(_names(options.only_cameras)), cameras[0])
+
+
 def choose(
     where: Path,
     files: Sequence[Path],

@@ -22,7 +22,7 @@ from ...errors import UserError
 from ...geometry.rotation import is_rotation
 from ...storage.numpy_files import read_npy
 from ..assemble import FrameRecord, assemble, with_points
-from ..choice import choose, of_cameras
+from ..choice import choose, held_camera, of_cameras
 from ..dataset import Dataset
 from ..depth_maps import DepthFile
 from ..depth_points import points_of_depth
@@ -40,8 +40,6 @@ FILE = "poses_bounds.npy"
 VIDEOS = (".mp4", ".mov", ".avi", ".mkv")
 MANY = "mv_images"
 """Folder of the images of all cameras of an instant, beside the film that takes one of them."""
-HELD_OUT_CAMERA = 0
-"""Index of the held-out camera among the chosen ones: the central one of Neural 3D Video, as in published results."""
 POINTS = ("points3D.ply", "points3D_downsample2.ply", "points3d.ply")
 MAX_ASPECT_ERROR = 0.01
 """Largest relative difference between the scale factors of width and height that is attributed to rounding."""
@@ -58,8 +56,9 @@ def recognises(folder: Path) -> bool:
 
 
 def read(folder: Path, split: str, options: ReadOptions) -> Dataset:
-    """Read one split: the first of the chosen cameras is ``test`` and ``val``, the others are ``train``. Of the film of
-    one camera, the views of the other cameras are held out or, without these, every eighth image.
+    """Read one split: the camera that is chosen first is ``test`` and ``val`` (of all, the first: the central one of
+    Neural 3D Video, as in published results), the others are ``train``. Of the film of one camera, the views of the
+    other cameras are held out or, without these, every eighth image.
 
     All cameras share the same times, which are evenly spaced in the order of the images' names.
 
@@ -77,10 +76,11 @@ def read(folder: Path, split: str, options: ReadOptions) -> Dataset:
             f"{path}: has {len(rows)} rows, but {folder} holds {len(cameras)} folders of images "
             f"({_label(folder, cameras[0])} to {_label(folder, cameras[-1])}); give each camera a row and a folder"
         )
-    wanted = of_cameras([_label(folder, camera) for camera in cameras], options)
+    labels = [_label(folder, camera) for camera in cameras]
+    wanted = of_cameras(labels, options)
     if len(wanted) < 2:
         raise UserError(f"--only-cameras {options.only_cameras}: name two cameras or more; the first is held out")
-    kept_out = wanted[HELD_OUT_CAMERA]
+    kept_out = labels.index(held_camera(labels, options))
     chosen = [index for index in wanted if (index == kept_out) != (split == "train")]
     files = _with_gaps([_files(camera) for camera in cameras])
     records = []

@@ -10,7 +10,7 @@ import numpy as np
 
 from ...errors import UserError
 from ..assemble import FrameRecord, assemble
-from ..choice import choose, of_cameras
+from ..choice import choose, held_camera, of_cameras
 from ..dataset import Dataset
 from ..images import ReadOptions, is_reduced, size_text
 from ..lens import Lens, make_lens, rescaled
@@ -45,8 +45,9 @@ def read_rig(
     *,
     held: Collection[str] = (),
 ) -> Dataset:
-    """Read one split: the cameras ``held`` or, if none of the chosen ones is among them, the first in the order of
-    names is ``test`` and ``val``; the others are ``train``. Times are those in the names of the instants.
+    """Read one split: the cameras ``held`` or, if none of the chosen ones is among them, the one that is chosen first
+    (of all, the first in the order of names) is ``test`` and ``val``; the others are ``train``. Times are those in the
+    names of the instants.
 
     Args:
         path: file that lists the cameras, named in messages.
@@ -68,9 +69,10 @@ def read_rig(
     if len(chosen) < 2:
         raise UserError(f"--only-cameras {options.only_cameras}: name two cameras or more; one is held out")
     names = {camera.name for camera in chosen}
-    outside = (names & set(held)) or {chosen[0].name}
+    first = held_camera([camera.name for camera in chosen], options)
+    outside = (names & set(held)) or {first}
     if outside == names:
-        outside = {chosen[0].name}
+        outside = {first}
     cut_out, unmasked = _cut_out(folder, chosen)
     instants = sorted({instant for camera in filmed for instant in camera.files}, key=natural)
     times = dict(zip(instants, times_from_names(instants) if len(instants) > 1 else [0.0]))

@@ -200,3 +200,14 @@ def test_masks_of_actors_hq_cut_out(tmp_path):
     assert not data.with_alpha and any(
         "1 of 12 images have no mask; no image is cut out" in note for note in data.notes
     )
+
+
+@pytest.mark.parametrize("write", [write_multipleview, write_poses_bounds])
+def test_the_camera_that_is_named_first_is_held_out(tmp_path, write):
+    """Of Technicolor's 16 cameras, papers hold out one in the middle."""
+    write(tmp_path)
+    names = sorted({frame.name[:5] for split in ("train", "test") for frame in load(tmp_path, split)})
+    assert {frame.name[:5] for frame in load(tmp_path, "test")} == {names[0]}
+    chosen = ",".join([names[2], names[0], names[1]])
+    assert {frame.name[:5] for frame in load(tmp_path, "test", only_cameras=chosen)} == {names[2]}
+    assert {frame.name[:5] for frame in load(tmp_path, "train", only_cameras=chosen)} == set(names[:2])
