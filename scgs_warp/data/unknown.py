@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import os
+import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
@@ -16,6 +17,9 @@ FILMS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".mts
 VIDEOS = (*FILMS, ".gif")
 ARCHIVES = (".zip", ".tar", ".gz", ".tgz", ".bz2", ".xz", ".7z", ".rar", ".zst")
 SPLATS = (".ply", ".splat", ".spz", ".sog", ".ksplat")
+PACKED = (".smc", ".h5", ".hdf5")
+MAPS = re.compile("(?:^|[/_-])(?:depth|mask|flow|disp|normal|seg|annotation|alpha|conf|matte)", re.IGNORECASE)
+"""What is in the names of folders of images that no camera took."""
 DEEPEST, MOST_FOLDERS = 3, 200
 """Depth to which, and number of folders in which, a data set is looked for."""
 FEWEST_PHOTOS = 3
@@ -26,9 +30,26 @@ FOREIGN = (
     (("rgb.txt", "rgb"), "the poses of TUM RGB-D are not read", "", "{folder}/rgb"),
     (("color", "pose"), "the poses of ScanNet are not read", "", "{folder}/color"),
     (("models.json",), "the cameras of Google's Immersive are not read", "", "--rig {folder}"),
+    (("camera.pkl",), "the cameras of People-Snapshot are a pickle, which can run programs", "nerfstudio", ""),
+    (("all_data.json",), "the cameras of PAC-NeRF are not read", "nerfstudio", ""),
+    (("cameras_sphere.npz",), "the cameras of NeuS are not read", "nerfstudio", ""),
+    (("KRT",), "the cameras of Multiface are not read", "EasyMocap", ""),
+    (
+        ("ego_pose", "extrinsics"),
+        "the cameras of Waymo, as EmerNeRF and others write them, are not read",
+        "nerfstudio",
+        "",
+    ),
+    (("traj.txt", "results"), "the cameras of Replica are not read", "nerfstudio", ""),
+    (("frame-000000.pose.txt",), "the cameras of 7-Scenes are not read", "nerfstudio", ""),
 )
 """Data sets that are not read: their files and folders, what is to be said, and the layout in which the cameras may be
 written, or what ``capture`` is to be given, which finds them anew."""
+RENAMED = (
+    ("transform*.json", "transforms.json", "frames and poses"),
+    ("poses_bounds*.npy", "poses_bounds.npy", "the cameras of LLFF, as RoDynRF writes them"),
+)
+"""Files that programs name otherwise than they are read, their right name, and what they hold."""
 SIGNS = (
     (b"<chunk", "Metashape", "ns-process-data metashape"),
     (b"#name,", "RealityCapture", "ns-process-data realitycapture"),
@@ -71,6 +92,11 @@ def not_a_folder(path: Path) -> UserError:
             f"{path}: is no folder; if it holds the cameras of MegaSaM, VGGT, Depth Anything 3 or Pi3: scgs-warp "
             f"capture --poses {shell_words(path)} --output {shell_words(f'data/{path.stem}')}"
         )
+    if suffix in PACKED:
+        return UserError(
+            f"{path}: images and cameras in HDF5, as those of DNA-Rendering, are not read; unpack them with the tools "
+            "of their data set, and write them in the layout of EasyMocap (docs/data.md)"
+        )
     if suffix == ".json" or path.name == "poses_bounds.npy":
         return UserError(f"{path}: is a file of a data set; give its folder: --data {shell_words(path.parent)}")
     if suffix in IMAGE_SUFFIXES:
@@ -104,20 +130,27 @@ def no_layout(folder: Path, recognised: Callable[[Path], bool]) -> UserError:
             f"{folder}: is an export of {program}; make a data set of it: scgs-warp capture --poses "
             f"{shell_words(folder)} --output {shell_words(f'data/{folder.resolve().name}')}"
         )
-    foreign = _foreign(folder, entries)
+    foreign = next(filter(None, map(_foreign, (folder, *_below(folder)))), None) or _of_program(entries)
     if foreign is not None:
         return UserError(foreign)
-    renamed = next((entry for entry in entries if entry.match("transform*.json") and entry.is_file()), None)
+    renamed = _renamed(entries)
     if renamed is not None:
-        return UserError(f"{renamed}: is read under another name; call it transforms.json if it lists frames and poses")
+        return UserError(renamed)
     if sum(entry.suffix.lower() in IMAGE_SUFFIXES for entry in entries) >= FEWEST_PHOTOS:
         return UserError(
             f"{folder}: holds images without cameras; find them with: scgs-warp capture {shell_words(folder)} --output "
             f"{shell_words(f'data/{folder.resolve().name}-cameras')}"
         )
-    film = next((entry for entry in entries if entry.suffix.lower() in VIDEOS), None)
+    film = next((entry for entry in entries if entry.suffix.lower() in (*VIDEOS, *PACKED)), None)
     if film is not None:
         return not_a_folder(film)
+    photos = _photos_below(folder)
+    if photos is not None:
+        return UserError(
+            f"{folder}: its cameras are in no layout that is read (docs/data.md lists them); write them as "
+            f"transforms.json of nerfstudio, or find those of {photos.name} anew: scgs-warp capture "
+            f"{shell_words(photos)} --output {shell_words(f'data/{folder.resolve().name}')}"
+        )
     return UserError(
         f"{folder}: holds no known layout: no transforms_train.json (D-NeRF, Blender), transforms.json (nerfstudio), "
         "dataset.json (HyperNeRF, NeRF-DS, DyCheck), train_meta.json (Panoptic), poses_bounds.npy (Neural 3D Video), "
@@ -126,8 +159,17 @@ def no_layout(folder: Path, recognised: Callable[[Path], bool]) -> UserError:
     )
 
 
-def _foreign(folder: Path, entries: list[Path]) -> str | None:
-    """Return the message about data of other programs that are not read; None for other folders."""
+def _renamed(entries: list[Path]) -> str | None:
+    """Return the message about a file of cameras that has another name than the one that is read; None without one."""
+    for pattern, name, what in RENAMED:
+        for entry in entries:
+            if entry.match(pattern) and entry.is_file():
+                return f"{entry}: is read under another name; call it {name} if it lists {what}"
+    return None
+
+
+def _foreign(folder: Path) -> str | None:
+    """Return the message about data sets that are not read; None for other folders."""
     for names, what, layout, given in FOREIGN:
         if all((folder / name).exists() for name in names):
             remedy = f"write them in the layout of {layout} (docs/data.md)"
@@ -135,6 +177,11 @@ def _foreign(folder: Path, entries: list[Path]) -> str | None:
                 output = shell_words(f"data/{folder.resolve().name}")
                 remedy = f"find them: scgs-warp capture {given.format(folder=shell_words(folder))} --output {output}"
             return f"{folder / names[0]}: {what}; {remedy}"
+    return None
+
+
+def _of_program(entries: list[Path]) -> str | None:
+    """Return the message about cameras of other programs that are not read; None if there are none."""
     for entry in entries:
         if entry.suffix.lower() in (".xml", ".csv", ".out") and entry.is_file():
             try:
@@ -168,7 +215,22 @@ def _exported_by(folder: Path) -> str | None:
         return "ViPE"
     if (folder / "camera_poses.txt").is_file() and (folder / "results_output").is_dir():
         return "DA3-Streaming"
+    if (folder / "0000.npz").is_file():
+        return "Uni4D"
     return "MonST3R" if (folder / "pred_traj.txt").is_file() else None
+
+
+def _photos_below(folder: Path) -> Path | None:
+    """Return the folder below with the most photographs; None if none holds ``FEWEST_PHOTOS``."""
+    counts: dict[Path, int] = {}
+    for inner in _below(folder):
+        if MAPS.search(inner.relative_to(folder).as_posix()) is None:
+            try:
+                counts[inner] = sum(name.lower().endswith(IMAGE_SUFFIXES) for name in os.listdir(inner))
+            except OSError:
+                continue
+    most = max(counts, key=lambda inner: counts[inner], default=None)
+    return most if most is not None and counts[most] >= FEWEST_PHOTOS else None
 
 
 def _below(folder: Path) -> Iterator[Path]:
@@ -187,5 +249,3 @@ def _below(folder: Path) -> Iterator[Path]:
                 return
             yield inner
         level = found
-    if (folder / "0000.npz").is_file():
-        return "Uni4D"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 
 import cv2
@@ -76,14 +77,21 @@ def test_a_folder_that_holds_a_film(tmp_path):
         load(tmp_path)
 
 
-def test_a_file_of_cameras_under_another_name(tmp_path):
+@pytest.mark.parametrize(
+    ("name", "expected"),
+    [
+        ("transformations.json", "call it transforms.json if it lists frames and poses"),
+        (
+            "poses_bounds_RoDynRF.npy",
+            "call it poses_bounds.npy if it lists the cameras of LLFF, as RoDynRF writes them",
+        ),
+    ],
+)
+def test_a_file_of_cameras_under_another_name(tmp_path, name, expected):
     """Older scripts of Spectacular AI write ``transformations.json``."""
     (tmp_path / "images").mkdir()
-    (tmp_path / "transformations.json").write_text("{}")
-    assert said(tmp_path) == (
-        f"{tmp_path / 'transformations.json'}: is read under another name; call it transforms.json if it lists frames "
-        "and poses"
-    )
+    (tmp_path / name).write_text("{}")
+    assert said(tmp_path) == f"{tmp_path / name}: is read under another name; {expected}"
 
 
 @pytest.mark.parametrize(
@@ -97,8 +105,8 @@ def test_a_file_of_cameras_under_another_name(tmp_path):
         (["odometry.csv", "rgb.mp4", "depth/000000.png"], "Stray Scanner"),
         (["camera/000000.npz", "color/000000.png"], "CUT3R"),
         (["camera_poses.txt", "results_output/frame_0.npz"], "DA3-Streaming"),
-        (["pose/film.npz", "rgb/film.mp4", "intrinsics/film.npz"], "ViPE"),
         (["0000.npz", "0001.npz", "fused_4d.npz"], "Uni4D"),
+        (["pose/film.npz", "rgb/film.mp4", "intrinsics/film.npz"], "ViPE"),
     ],
 )
 def test_exports_that_capture_reads(tmp_path, files, program):
@@ -119,6 +127,10 @@ def test_exports_that_capture_reads(tmp_path, files, program):
         (["rgb.txt", "groundtruth.txt", "rgb/1.5.png"], "find them: scgs-warp capture {path}/rgb --output data/"),
         (["color/0.jpg", "pose/0.txt", "depth/0.png"], "find them: scgs-warp capture {path}/color --output data/"),
         (["models.json", "camera_0001.mp4"], "find them: scgs-warp capture --rig {path} --output data/"),
+        (["cameras_sphere.npz", "image/000.png"], "NeuS are not read; write them in the layout of nerfstudio"),
+        (["images/000_0.jpg", "ego_pose/000.txt", "extrinsics/0.txt"], "Waymo, as EmerNeRF and others write them"),
+        (["a/frame-000000.pose.txt", *(f"a/frame-00000{i}.png" for i in range(4))], "7-Scenes are not read; write"),
+        (["0012_11.smc"], "0012_11.smc: images and cameras in HDF5, as those of DNA-Rendering, are not read; unpack"),
     ],
 )
 def test_data_sets_that_are_not_read(tmp_path, files, expected):
@@ -127,6 +139,18 @@ def test_data_sets_that_are_not_read(tmp_path, files, expected):
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_bytes(b"")
     assert expected.format(path=tmp_path) in said(tmp_path)
+
+
+def test_cameras_in_no_known_layout(tmp_path):
+    """KITTI, DAVIS and what networks prepare: the photographs are found, not the maps of as many pixels beside them."""
+    for name in ("depth/480p/bear", "JPEGImages/480p/bear", "Annotations/480p/bear"):
+        (tmp_path / name).mkdir(parents=True)
+        for index in range(4):
+            (tmp_path / name / f"{index:05d}.png").write_bytes(b"")
+    photos = tmp_path / "JPEGImages/480p/bear"
+    assert f"or find those of bear anew: scgs-warp capture {photos} --output data/" in said(tmp_path)
+    shutil.rmtree(tmp_path / "JPEGImages")
+    assert "holds no known layout" in said(tmp_path)
 
 
 @pytest.mark.parametrize(
