@@ -1,8 +1,9 @@
 """Reader of the D-NeRF / Blender layout: ``transforms_{train,val,test}.json`` beside folders of images.
 
 ``camera_angle_x`` (horizontal field of view, radians) or ``fl_x, fl_y, cx, cy, w, h`` (pixels); per frame
-``file_path``, ``transform_matrix`` (camera-to-world, OpenGL: x right, y up, z backward), ``time`` in [0, 1] and, if the
-frame has one, ``mask_path`` (black: not valid). ``points3d.ply``: initial points, if the images are filled.
+``file_path``, ``transform_matrix`` (camera-to-world, OpenGL: x right, y up, z backward), ``time`` in [0, 1] or else
+``timestep_index`` or ``timestamp``, and, if the frame has them, ``mask_path`` (black: not valid) and ``fg_mask_path``
+(black: transparent). ``points3d.ply``: initial points, if the images are filled.
 Layout: Pumarola et al., D-NeRF, CVPR 2021, and NeRF's Blender scenes.
 """
 

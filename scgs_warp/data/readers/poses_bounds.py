@@ -33,7 +33,7 @@ from ..natural_order import by_name, natural
 from ..points import read_points
 from .colmap_images import reduced_folders
 from .colmap_model import find_model
-from .surgical import as_llff, find_surgical
+from .surgical import as_llff, find_surgical, notes_of_masks
 from .transforms import IMAGE_SUFFIXES
 
 FILE = "poses_bounds.npy"
@@ -139,7 +139,10 @@ def _read_film(folder: Path, files: list[Path], rows: np.ndarray, split: str, op
         records = [record(files[index], index, index, files[index].stem) for index in chosen]
     data = assemble(records, options, folder=folder, split=split, notes=choice.notes)
     data.bounds = _bounds(rows[choice.indices, 15:])
-    points = points_of_depth(data) if surgical is not None and split == "train" else None
+    if surgical is None or split != "train":
+        return data
+    data.notes = (*data.notes, *notes_of_masks(folder, data))
+    points = points_of_depth(data)
     return data if points is None else with_points(data, *points)
 
 

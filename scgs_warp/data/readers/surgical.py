@@ -14,9 +14,12 @@ from typing import NamedTuple
 
 import numpy as np
 
+from ..dataset import Dataset, spread
 from .transforms import IMAGE_SUFFIXES
 
 MASKS, DEPTH = "masks", "depth"
+SAMPLED, LEAST_LEFT = 8, 0.5
+"""Number of frames whose masks are looked at, and the share of their pixels that tools leave at least."""
 
 
 class Surgical(NamedTuple):
@@ -31,6 +34,18 @@ def find_surgical(folder: Path, count: int) -> Surgical | None:
     """Return the masks and depth maps of ``count`` images; None without one of each for every image."""
     found = Surgical(*(_files(folder / name) for name in (MASKS, DEPTH)))
     return found if len(found.masks) == len(found.depth) == count else None
+
+
+def notes_of_masks(folder: Path, data: Dataset) -> tuple[str, ...]:
+    """Return a note if most of what the frames show is masked, as by masks that are white on the scene instead."""
+    masks = [data[index].mask for index in spread(len(data), SAMPLED)]
+    left = float(np.mean([1.0 if mask is None else float(mask.float().mean()) for mask in masks]))
+    if left >= LEAST_LEFT:
+        return ()
+    line = (
+        f"{folder / MASKS}: leave {left:.0%} of the pixels; they are white on tools: invert them if white is the scene"
+    )
+    return (line,)
 
 
 def _files(folder: Path) -> list[Path]:

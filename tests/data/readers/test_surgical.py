@@ -50,6 +50,16 @@ def test_tools_are_masked_and_depth_is_read(tmp_path, kind):
     assert float((data.points[:, 1] / UNIT - 3.0).abs().max()) < 0.1  # the wall
 
 
+def test_masks_of_the_scene_instead_of_the_tools_are_noted(tmp_path):
+    write(tmp_path)
+    assert not load(tmp_path).notes
+    for file in (tmp_path / "masks").iterdir():
+        mask = cv2.imread(str(file), cv2.IMREAD_GRAYSCALE)
+        assert mask is not None
+        cv2.imwrite(str(file), 255 - mask if mask.any() else mask)
+    assert "invert them if white is the scene" in load(tmp_path).notes[0]
+
+
 def test_without_depth_it_is_a_film_of_llff(tmp_path):
     write(tmp_path)
     for file in (tmp_path / "depth").iterdir():
