@@ -70,10 +70,10 @@ def cut_out(path: Path, pixels: np.ndarray, mask_path: Path, mask: np.ndarray) -
             f"{mask_path}: is {columns} x {rows} pixels, but its image {path.name} {width} x {height}; give it the "
             "proportions of the image"
         )
+    grey, largest = mask[..., :3].max(axis=2), float(np.iinfo(mask.dtype).max)
+    share = grey.astype(np.float32) / (1.0 if grey.max() == 1 else largest)  # some programs write 0 and 1
     if (height, width) != (rows, columns):
-        mask = cv2.resize(mask, (width, height), interpolation=cv2.INTER_AREA)
-    grey, largest = mask[..., :3].max(axis=2), np.iinfo(mask.dtype).max
-    share = grey / (1.0 if grey.max() == 1 else largest)  # some programs write 0 and 1
+        share = cv2.resize(share, (width, height), interpolation=cv2.INTER_AREA)
     alpha = np.rint(share * np.iinfo(pixels.dtype).max).astype(pixels.dtype)
     return np.dstack([pixels[..., :3], alpha])
 
