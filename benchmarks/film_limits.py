@@ -35,8 +35,9 @@ from scgs_warp.data.synthetic.films.encoding import decoded
 from scgs_warp.data.synthetic.films.request import FilmRequest
 from scgs_warp.data.synthetic.films.shooting import Shooting
 from scgs_warp.data.synthetic.films.stage import Hits, Stage, stage_of
-from scgs_warp.data.synthetic.films.truth import OPENGL, flow_to
+from scgs_warp.data.synthetic.films.truth import flow_to
 from scgs_warp.data.synthetic.raycast import PosedSurface
+from scgs_warp.geometry.rotation import OPENGL_TO_OPENCV
 from scgs_warp.runtime.provenance import command_line, provenance
 from scgs_warp.storage.files import read_text
 from scgs_warp.storage.json_files import parse_json
@@ -131,7 +132,7 @@ def held_out_views(folder: Path, shooting: Shooting, name: str) -> Iterator[Pict
     content = parse_json(read_text(folder / "transforms.json"))
     for frame in content["frames"]:
         if frame["file_path"] in content["test_filenames"]:
-            viewmat = torch.from_numpy(np.linalg.inv(np.array(frame["transform_matrix"]) @ OPENGL)).float()
+            viewmat = torch.from_numpy(np.linalg.inv(np.array(frame["transform_matrix"]) @ OPENGL_TO_OPENCV)).float()
             camera = Camera(viewmat, torch.from_numpy(view.K).float(), view.width, view.height)
             yield Picture(frame["time"], camera, read_rgb(folder / frame["file_path"]).astype(np.float32) / 255.0)
 

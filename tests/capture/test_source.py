@@ -14,7 +14,7 @@ from PIL import Image
 from helpers.films import encoded, mask_images, pan, stream
 from scgs_warp.capture.digests import DIGEST_BYTES
 from scgs_warp.capture.folder_content import photographs_left_out
-from scgs_warp.capture.rig.instants import frame_seconds
+from scgs_warp.capture.rig.instants import recorded
 from scgs_warp.capture.source import Folder, Video, open_source
 from scgs_warp.errors import UserError
 from scgs_warp.storage import heif_files
@@ -39,7 +39,7 @@ def test_the_name_of_a_film_may_hold_a_colon(tmp_path, monkeypatch):
     with film("take:2.mp4", 10) as writer:
         for level in (0, 100, 200):
             writer.write(np.full((16, 16, 3), level, np.uint8))
-    assert open_source(Path("take:2.mp4")).count == 3 and len(frame_seconds(Path("take:2.mp4"))) == 3
+    assert open_source(Path("take:2.mp4")).count == 3 and len(recorded(Path("take:2.mp4")).seconds) == 3
 
 
 def test_pixels_are_made_square(tmp_path):
@@ -87,7 +87,7 @@ def test_a_cover_before_the_film_is_passed_over(tmp_path):
         for stream in (cover, film_of_it):
             container.mux(stream.encode())
     assert len(list(Video(tmp_path / "film.mkv").frames(200))) == 20
-    assert len(frame_seconds(tmp_path / "film.mkv")) == 20
+    assert len(recorded(tmp_path / "film.mkv").seconds) == 20
 
 
 def test_a_film_that_changes_its_size_is_usable_up_to_there(tmp_path):

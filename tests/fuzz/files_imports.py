@@ -23,8 +23,9 @@ def _loader(source: Callable[[Path], Path]) -> Callable[[Path], None]:
 
 
 def _found(folder: Path) -> Path:
-    """Return the .npz in a folder, else the folder."""
-    return next(iter(sorted(folder.glob("*.npz"))), folder)
+    """Return the .npz in a folder; the folder if it has none, or one for each frame."""
+    files = list(folder.glob("*.npz"))
+    return files[0] if len(files) == 1 else folder
 
 
 FORMATS = tuple(
