@@ -12,12 +12,12 @@ comes from ``results/sharing-NAME.json``, one-process runs from ``results/sharin
 The table of edits comes from ``results/edit-cpu.json`` and ``results/edit-4096-cpu.json`` (``apps/bench.py edit``, with
 and without ``--nodes 4096``), that of meshes from ``results/mesh-distance.json`` (``mesh_distance.py``), that of edges
 of masks from ``results/mask-edges.json`` (``mask_edges.py``), that of optical flow from ``results/optical-flow.json``
-(``optical_flow.py``), those of a filmed room from ``results/filmed-room.json`` (``filmed_room.py``), that of means from
-``results/mean-of-runs.json`` (``mean_of_runs.py``), that of long films from ``results/long-film-memory.json``
-(``long_film.py memory``), that of zeros in ``docs/benchmarks.md`` from ``results/network-zeros.json``
-(``network_zeros.py``). Those of pages come from ``results/page-million.json`` (``page_frames.py``) and
-``results/live-cost.json`` (``live_cost.py``), and that of soaks from ``results/chaos-PART.json`` (``chaos.py --part
-PART --minutes 118``).
+(``optical_flow.py``), those of a filmed room from ``results/filmed-room.json`` (``filmed_room.py``), that of true shape
+and motion from ``results/film-limits-FILM.json`` (``film_limits.py``), that of means from ``results/mean-of-runs.json``
+(``mean_of_runs.py``), that of long films from ``results/long-film-memory.json`` (``long_film.py memory``), that of
+zeros in ``docs/benchmarks.md`` from ``results/network-zeros.json`` (``network_zeros.py``). Those of pages come from
+``results/page-million.json`` (``page_frames.py``) and ``results/live-cost.json`` (``live_cost.py``), and that of soaks
+from ``results/chaos-PART.json`` (``chaos.py --part PART --minutes 118``).
 """
 
 from __future__ import annotations
@@ -160,6 +160,16 @@ def film_views(results: Results) -> str:
     return table(head, lines)
 
 
+def film_limits(results: Results) -> str:
+    """Write what the pictures of a rig and of a phone give of held-out views if shape and motion are known."""
+    lines = []
+    for name, label in (("film-limits-rig", "rig, 8 degrees"), ("film-limits-phone", "phone")):
+        one = results[name]
+        scores = (number(one[part], 2) for part in ("psnr", "mover", "room"))
+        lines.append([label, *scores, f"{100 * one['unseen']:.1f} %"])
+    return table(["true shape and motion, colours of the film", "PSNR", "the robot", "the room", "not filmed"], lines)
+
+
 def long_film_memory(results: Results) -> str:
     """Write how much memory reading a film takes, by its length."""
     lines = []
@@ -253,6 +263,9 @@ REPEATABLE = {
     "capture-optical-flow": Repeatable(optical_flow, ("optical-flow",), ("scgs_warp/geometry/optical_flow.py",)),
     "capture-films": Repeatable(film_captures, ("filmed-room",), ("scgs_warp/capture",)),
     "capture-film-views": Repeatable(film_views, ("filmed-room",), ("scgs_warp/capture", *TRAINING)),
+    "capture-film-limits": Repeatable(
+        film_limits, ("film-limits-rig", "film-limits-phone"), ("scgs_warp/data/synthetic/films",)
+    ),
     "capture-long-films": Repeatable(
         long_film_memory, ("long-film-memory",), ("scgs_warp/training/silhouettes.py", "scgs_warp/data/cache.py")
     ),
