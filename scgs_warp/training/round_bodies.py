@@ -14,10 +14,13 @@ from ..ops.sampling import farthest_points
 from ..runtime.search_tree import search_tree
 from .turn_views import Views
 
-SAMPLE = 3000
-"""Largest number of Gaussians of which the bodies are made; the others belong to the body of the nearest of them."""
+SAMPLE, SAMPLE_OF = 3000, 12_000
+"""Largest number of Gaussians of which the bodies are made, and of those from which they are sampled; the others belong
+to the body of the nearest of the sample."""
 INSTANTS = 24
 """Number of instants at which Gaussians must be close to each other."""
+EVERY = 3
+"""Of these, only every third tells how far apart two paths are: sampling takes time for each."""
 NEAR, TOGETHER = 3.0, 4.0
 """Largest distance of two Gaussians of one body: at one of three instants, and at all, in spacings of the sample."""
 FEWEST = 30
@@ -64,10 +67,11 @@ def find_round_bodies(tracks: np.ndarray, solid: np.ndarray, views: Views) -> li
         solid: [N] bool, the Gaussians that are opaque enough to show a surface.
     """
     sampled = np.flatnonzero(solid)
+    sampled = sampled[:: max(1, -(-len(sampled) // SAMPLE_OF))]
     if len(sampled) < FEWEST:
         return []
     few = tracks[np.linspace(0, len(tracks) - 1, min(INSTANTS, len(tracks))).round().astype(int)]
-    paths = np.ascontiguousarray(few.transpose(1, 0, 2).reshape(tracks.shape[1], -1))
+    paths = np.ascontiguousarray(few[::EVERY].transpose(1, 0, 2).reshape(tracks.shape[1], -1))
     chosen = farthest_points(torch.from_numpy(paths[sampled]), min(SAMPLE, len(sampled)))
     sampled = sampled[chosen.cpu().numpy()]
     labels = _together(few[:, sampled])
