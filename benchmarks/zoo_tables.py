@@ -207,6 +207,7 @@ def rig(source: Source) -> str:
         "20": "20 degrees",
         "8-before": "8 degrees, without stereo",
         "8": "8 degrees",
+        "8-long": "8 degrees, all 24,000 steps",
     }
     lines = []
     for row, label in rows.items():
