@@ -31,7 +31,7 @@ from .resuming import as_begun
 from .run_folder import ReadOnlyRunFolder, RunFolder, begin_or_resume, end_here
 from .second_try import try_again
 from .state import StepResult, TrainState
-from .stepping import Steps, steps_of, take_step
+from .stepping import steps_of, take_step
 from .turns import add_turns, turns_due
 from .vanishing import refuse_empty, shows_nothing
 
@@ -113,12 +113,13 @@ def fit(
         # 3. Train.
         with progress(config.steps, "training", start=state.step) as bar, stop_signals() as stop:
             folder.tell, frames.interrupted, bar.stop = bar.print, stop.is_set, stop.set
+            run = _Run(state, frames, folder, bar, stop, test, watcher)
             try:
                 check_replicas(state)
-                _train(state, frames, folder, test, bar, stop, watcher)
+                run.train()
                 refuse_empty(state, frames.data, folder.path)
             except ProcessLost as lost:
-                raise _process_lost(state, folder, lost) from lost
+                raise run.after_loss(lost) from lost
         state.motion.eval()
         scene = state.scene()
         scene.folder = folder.path.absolute()
@@ -135,233 +136,223 @@ class Watcher(Protocol):
     def show(self, state: TrainState) -> None: ...
 
 
-def _train(
-    state: TrainState,
-    frames: Frames,
-    folder: RunFolder,
-    test: Dataset | None,
-    bar: Progress,
-    stop: threading.Event,
-    watcher: Watcher | None,
-) -> None:
-    """Repeat training steps until the last one, or until a stop is requested."""
-    config, steps = state.config, steps_of(state, frames, bar.print)
-    noted = False  # that memory limits the number of Gaussians
-    saved_at, empty_checks = time.monotonic(), 0
-    while state.step < config.steps:
-        # 1. Enter the main stage when stage 1 is over.
-        if state.stage == "pretrain" and state.step >= config.pretrain_steps:
-            _settle(state, steps, folder, bar)
-            steps.release()
-            _perhaps_again(state, frames, folder, bar, stop, watcher)
-            state.begin_main()
+class _Run:
+    """A run under way: its state, and what reads frames for it, records, shows and stops it."""
 
-        if turns_due(state, frames.data):
-            _settle(state, steps, folder, bar)
-            steps.release()
-            _add_turns(state, frames, folder, bar, stop)
+    def __init__(
+        self,
+        state: TrainState,
+        frames: Frames,
+        folder: RunFolder,
+        bar: Progress,
+        stop: threading.Event,
+        test: Dataset | None,
+        watcher: Watcher | None,
+    ) -> None:
+        self.state, self.frames, self.folder = state, frames, folder
+        self.bar, self.stop, self.test, self.watcher = bar, stop, test, watcher
+        self.steps = steps_of(state, frames, bar.print)
 
-        # 2. Render, compare and update the parameters.
-        done = state.step + 1
-        tested = test is not None and (done % config.evaluate_every == 0 or done == config.steps)
-        watched = watcher is not None and watcher.due()
-        results, visible = _take(state, frames, folder, bar, steps, tested or watched or folder.shows(done))
-        for result in results:
-            _count_failure(state, steps, result, folder, bar)
+    def train(self) -> None:
+        """Repeat training steps until the last one, or until a stop is requested."""
+        state, folder, config = self.state, self.folder, self.state.config
+        noted = False  # that memory limits the number of Gaussians
+        saved_at, empty_checks = time.monotonic(), 0
+        while state.step < config.steps:
+            # 1. Enter the main stage when stage 1 is over; add the turns of round bodies.
+            if state.stage == "pretrain" and state.step >= config.pretrain_steps:
+                self._pause()
+                self._perhaps_again()
+                state.begin_main()
+            if turns_due(state, self.frames.data):
+                self._pause()
+                self._add_turns()
 
-        # 3. Score held-out frames, before an opacity reset could put a dip into the curve.
-        if test is not None and tested:
-            folder.log_test_psnr(state.scene(), test, done)
+            # 2. Render, compare and update the parameters.
+            done = state.step + 1
+            tested = self.test is not None and (done % config.evaluate_every == 0 or done == config.steps)
+            watched = self.watcher is not None and self.watcher.due()
+            results, visible = self._take(looked_at=tested or watched or folder.shows(done))
+            for result in results:
+                self._count_failure(result)
 
-        # 4. Adaptive density control.
-        state.consistent = False
-        note = control_density(state, results[-1].size, visible) if density_due(state) else None
-        if note is not None and not noted:
-            noted = True
-            _tell(note, state, folder, bar, done=state.step)
-        state.step = done
-        state.consistent = True
+            # 3. Score held-out frames, before an opacity reset could put a dip into the curve.
+            if self.test is not None and tested:
+                folder.log_test_psnr(state.scene(), self.test, done)
 
-        # 5. Show and log.
-        if watched and watcher is not None:
-            watcher.show(state)
-        for result in results:
-            folder.record(state, result, bar)
+            # 4. Adaptive density control.
+            state.consistent = False
+            note = control_density(state, results[-1].size, visible) if density_due(state) else None
+            if note is not None and not noted:
+                noted = True
+                self._note(note, done=state.step)
+            state.step = done
+            state.consistent = True
 
-        # 6. Agree with the other processes on stopping, and on the scene; save, stop.
-        last = state.step == config.steps
-        stopping = _stopping(state, stop)
-        if last or stopping or state.step % COMPARE_EVERY == 0:
-            check_replicas(state)
-        if time.monotonic() - saved_at >= config.checkpoint_seconds or last or stopping:
-            _settle(state, steps, folder, bar)
-            state.save(folder.path)
-            saved_at = time.monotonic()
-        if stopping:
-            _stop(state, bar)
-        if state.step % COMPARE_EVERY == 0 and not last:
-            empty_checks = empty_checks + 1 if shows_nothing(state.scene(), frames.data) else 0
-            if empty_checks == MOST_EMPTY:
+            # 5. Show and log.
+            if watched and self.watcher is not None:
+                self.watcher.show(state)
+            for result in results:
+                folder.record(state, result, self.bar)
+
+            # 6. Agree with the other processes on stopping, and on the scene; save, stop.
+            last = state.step == config.steps
+            stopping = self._stopping()
+            if last or stopping or state.step % COMPARE_EVERY == 0:
+                check_replicas(state)
+            if time.monotonic() - saved_at >= config.checkpoint_seconds or last or stopping:
+                self._settle()
                 state.save(folder.path)
-                refuse_empty(state, frames.data, folder.path)
+                saved_at = time.monotonic()
+            if stopping:
+                self._end()
+            if state.step % COMPARE_EVERY == 0 and not last:
+                empty_checks = empty_checks + 1 if shows_nothing(state.scene(), self.frames.data) else 0
+                if empty_checks == MOST_EMPTY:
+                    state.save(folder.path)
+                    refuse_empty(state, self.frames.data, folder.path)
 
-
-def _perhaps_again(
-    state: TrainState,
-    frames: Frames,
-    folder: RunFolder,
-    bar: Progress,
-    stop: threading.Event,
-    watcher: Watcher | None,
-) -> None:
-    """Train stage 1 a second time if the configuration leaves the choice between both to the result."""
-    total, began = state.steps_again, time.monotonic()
-    if not total:
-        return
-    state.save(folder.path)
-    bar.print(f"step {state.step}: stage 1 is tried a second time, frame by frame")
-
-    def go_on(second: TrainState) -> None:
-        left = (time.monotonic() - began) / second.step * (total - second.step)
-        bar.beside(second=f"{second.step:,}/{total:,}, {clock(left)} left")
-        if watcher is not None and watcher.due():
-            watcher.show(second)
-        if _stopping(state, stop):
-            _stop(state, bar)
-
-    try:
-        note = try_again(state, frames, partial(steps_of, tell=bar.print), go_on)
-    except ProcessLost:
-        raise
-    except StepInterrupted:
-        _stop(state, bar)
-    except UserError as error:
-        raise _saved(state, error) from error
-    bar.beside(second=None)
-    _tell(note, state, folder, bar, done=state.step + 1)
-
-
-def _add_turns(state: TrainState, frames: Frames, folder: RunFolder, bar: Progress, stop: threading.Event) -> None:
-    """Add the turns of round bodies to the motion; a run that is stopped here looks for them again when resumed."""
-
-    def tell(text: str) -> None:
-        bar.beside(turns=text)
-        if stop.is_set():
-            raise StepInterrupted
-
-    state.save(folder.path)
-    try:
-        note = add_turns(state, frames, tell)
-    except StepInterrupted:
-        _stop(state, bar)
-    except FrameError as error:
-        raise _saved(state, error) from error
-    bar.beside(turns=None)
-    if note is not None:
-        _tell(note, state, folder, bar, done=state.step + 1)
-
-
-def _tell(note: str, state: TrainState, folder: RunFolder, bar: Progress, done: int) -> None:
-    """Print what was found, and log it at step ``done``: a resumed run repeats what lies after its checkpoint."""
-    bar.print(f"step {state.step}: {note}")
-    folder.log({"step": done, "stage": state.stage, "note": note})
-
-
-def _stopping(state: TrainState, stop: threading.Event) -> bool:
-    """Return whether a process is to stop; all processes get the same answer."""
-    return stop.is_set() if state.group is None else state.group.any(stop.is_set())
-
-
-def _stop(state: TrainState, bar: Progress) -> NoReturn:
-    """Stop after the checkpoint has been saved."""
-    if state.group is not None:
-        state.group.barrier()  # torchrun ends all processes when one has ended: the first must have saved
-    bar.print(f"stopped at step {state.step}; the checkpoint is saved, continue with --resume")
-    raise bar.raised or KeyboardInterrupt
-
-
-def _saved(state: TrainState, error: UserError) -> UserError:
-    """Add to an error, such as an image that is no longer readable, that the checkpoint has been saved."""
-    saved = f"step {state.step} is saved: " if state.group is None or state.group.first else ""
-    return UserError(f"{error}; {saved}continue with --resume")
-
-
-def _take(
-    state: TrainState,
-    frames: Frames,
-    folder: RunFolder,
-    bar: Progress,
-    steps: Steps,
-    looked_at: bool,
-) -> tuple[list[StepResult], Tensor | None]:
-    """Take a step; save the checkpoint if that fails.
-
-    Args:
-        looked_at: the step's result is needed at once.
-
-    Returns:
-        The results of all steps that have become known, and the visible Gaussians (``visible_gaussians``).
-    """
-    results: list[StepResult] = []
-    try:
-        visible = take_step(state, frames, steps, results, looked_at)
-        return results, visible
-    except (NotEnoughMemory, StepInterrupted, FrameError) as error:
-        _settle(state, steps, folder, bar, results)
-        state.save(folder.path)
-        if isinstance(error, StepInterrupted):
-            _stop(state, bar)
-        if isinstance(error, FrameError):
-            raise _saved(state, error) from error
-        raise  # nothing has changed yet: a machine with more memory can continue
-
-
-def _settle(
-    state: TrainState, steps: Steps, folder: RunFolder, bar: Progress, known: Sequence[StepResult] = ()
-) -> None:
-    """Wait for the steps in flight, and report them after those ``known``."""
-    for result in [*known, *steps.settle()]:
-        _count_failure(state, steps, result, folder, bar)
-        folder.record(state, result, bar)
-
-
-def _process_lost(state: TrainState, folder: RunFolder, lost: ProcessLost) -> UserError:
-    """Save the state, if it is consistent, after another process has been lost. No further step can be completed, but
-    usually none has begun: parameters change only when the gradients of all views are available."""
-    assert state.group is not None
-    if state.step == 0:
-        return UserError(f"{folder.path}: {lost}; no step was done yet")
-    if state.consistent:
-        state.save(folder.path)
-    where = f"step {state.step} is saved" if state.group.first and state.consistent else f"reached step {state.step}"
-    return UserError(
-        f"{folder.path}: {lost}; {where}, continue from the checkpoint with --resume, on one process or any number "
-        f"that divides batch {state.config.batch}"
-    )
-
-
-def _count_failure(state: TrainState, steps: Steps, result: StepResult, folder: RunFolder, bar: Progress) -> None:
-    """Count the dropped steps in a row, and report a dropped step.
-
-    Raises:
-        UserError: too many steps in a row were dropped.
-    """
-    term = result.failed
-    if term is None:
-        state.failures = 0
-        return
-    state.failures += 1
-    bar.print(f"step {result.step}: {term} is not finite; the step was dropped")
-    folder.log({"step": result.step, "stage": state.stage, "dropped": term})
-    if state.failures >= MOST_FAILURES:
-        # No dropped step has touched the parameters. A step in flight is part of the saved state.
-        for late in steps.settle():
-            state.step = late.step + 1
-        failures, state.failures = state.failures, 0  # a run that goes on may drop as many again
-        state.save(folder.path)
-        state.failures = failures
-        raise UserError(
-            f"{folder.path}: {term} was not finite {MOST_FAILURES} times in a row, up to step {state.step}; the "
-            "checkpoint holds the last good state; check the data, then --resume, or train again with lower learning "
-            "rates and another --output"
+    def after_loss(self, lost: ProcessLost) -> UserError:
+        """Save the state, if it is consistent, after another process has been lost. No further step can be completed,
+        but usually none has begun: parameters change only when the gradients of all views are available."""
+        state, path = self.state, self.folder.path
+        assert state.group is not None
+        if state.step == 0:
+            return UserError(f"{path}: {lost}; no step was done yet")
+        if state.consistent:
+            state.save(path)
+        saved = state.group.first and state.consistent
+        where = f"step {state.step} is saved" if saved else f"reached step {state.step}"
+        return UserError(
+            f"{path}: {lost}; {where}, continue from the checkpoint with --resume, on one process or any number "
+            f"that divides batch {state.config.batch}"
         )
+
+    def _perhaps_again(self) -> None:
+        """Train stage 1 a second time if the configuration leaves the choice between both to the result."""
+        state, bar = self.state, self.bar
+        total, began = state.steps_again, time.monotonic()
+        if not total:
+            return
+        state.save(self.folder.path)
+        bar.print(f"step {state.step}: stage 1 is tried a second time, frame by frame")
+
+        def go_on(second: TrainState) -> None:
+            left = (time.monotonic() - began) / second.step * (total - second.step)
+            bar.beside(second=f"{second.step:,}/{total:,}, {clock(left)} left")
+            if self.watcher is not None and self.watcher.due():
+                self.watcher.show(second)
+            if self._stopping():
+                self._end()
+
+        try:
+            note = try_again(state, self.frames, partial(steps_of, tell=bar.print), go_on)
+        except ProcessLost:
+            raise
+        except StepInterrupted:
+            self._end()
+        except UserError as error:
+            raise self._saved(error) from error
+        bar.beside(second=None)
+        self._note(note, done=state.step + 1)
+
+    def _add_turns(self) -> None:
+        """Add the turns of round bodies to the motion; a run that is stopped here looks for them again when resumed."""
+
+        def tell(text: str) -> None:
+            self.bar.beside(turns=text)
+            if self.stop.is_set():
+                raise StepInterrupted
+
+        self.state.save(self.folder.path)
+        try:
+            note = add_turns(self.state, self.frames, tell)
+        except StepInterrupted:
+            self._end()
+        except FrameError as error:
+            raise self._saved(error) from error
+        self.bar.beside(turns=None)
+        if note is not None:
+            self._note(note, done=self.state.step + 1)
+
+    def _take(self, looked_at: bool) -> tuple[list[StepResult], Tensor | None]:
+        """Take a step; save the checkpoint if that fails.
+
+        Args:
+            looked_at: the step's result is needed at once.
+
+        Returns:
+            The results of all steps that have become known, and the visible Gaussians (``visible_gaussians``).
+        """
+        results: list[StepResult] = []
+        try:
+            visible = take_step(self.state, self.frames, self.steps, results, looked_at)
+            return results, visible
+        except (NotEnoughMemory, StepInterrupted, FrameError) as error:
+            self._settle(results)
+            self.state.save(self.folder.path)
+            if isinstance(error, StepInterrupted):
+                self._end()
+            if isinstance(error, FrameError):
+                raise self._saved(error) from error
+            raise  # nothing has changed yet: a machine with more memory can continue
+
+    def _settle(self, known: Sequence[StepResult] = ()) -> None:
+        """Wait for the steps in flight, and report them after those ``known``."""
+        for result in [*known, *self.steps.settle()]:
+            self._count_failure(result)
+            self.folder.record(self.state, result, self.bar)
+
+    def _pause(self) -> None:
+        """Settle, and let go of the state's tensors, which are to be replaced."""
+        self._settle()
+        self.steps.release()
+
+    def _count_failure(self, result: StepResult) -> None:
+        """Count the dropped steps in a row, and report a dropped step.
+
+        Raises:
+            UserError: too many steps in a row were dropped.
+        """
+        state, path, term = self.state, self.folder.path, result.failed
+        if term is None:
+            state.failures = 0
+            return
+        state.failures += 1
+        self.bar.print(f"step {result.step}: {term} is not finite; the step was dropped")
+        self.folder.log({"step": result.step, "stage": state.stage, "dropped": term})
+        if state.failures >= MOST_FAILURES:
+            # No dropped step has touched the parameters. A step in flight is part of the saved state.
+            for late in self.steps.settle():
+                state.step = late.step + 1
+            failures, state.failures = state.failures, 0  # a run that goes on may drop as many again
+            state.save(path)
+            state.failures = failures
+            raise UserError(
+                f"{path}: {term} was not finite {MOST_FAILURES} times in a row, up to step {state.step}; the "
+                "checkpoint holds the last good state; check the data, then --resume, or train again with lower "
+                "learning rates and another --output"
+            )
+
+    def _note(self, note: str, done: int) -> None:
+        """Print what was found, and log it at step ``done``: a resumed run repeats what lies after its checkpoint."""
+        self.bar.print(f"step {self.state.step}: {note}")
+        self.folder.log({"step": done, "stage": self.state.stage, "note": note})
+
+    def _stopping(self) -> bool:
+        """Return whether a process is to stop; all processes get the same answer."""
+        asked = self.stop.is_set()
+        return asked if self.state.group is None else self.state.group.any(asked)
+
+    def _end(self) -> NoReturn:
+        """Stop after the checkpoint has been saved."""
+        if self.state.group is not None:
+            self.state.group.barrier()  # torchrun ends all processes when one has ended: the first must have saved
+        self.bar.print(f"stopped at step {self.state.step}; the checkpoint is saved, continue with --resume")
+        raise self.bar.raised or KeyboardInterrupt
+
+    def _saved(self, error: UserError) -> UserError:
+        """Add to an error, such as an image that is no longer readable, that the checkpoint has been saved."""
+        group = self.state.group
+        saved = f"step {self.state.step} is saved: " if group is None or group.first else ""
+        return UserError(f"{error}; {saved}continue with --resume")
