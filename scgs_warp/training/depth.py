@@ -19,6 +19,7 @@ from ..config.presets import TrainConfig
 from ..data.dataset import Dataset
 from ..errors import FrameError, UserError
 from ..geometry.cameras import scaled_camera
+from ..geometry.view_rays import ray_of
 from ..ops.binning import bin_splats
 from ..ops.compositing import composite
 from ..ops.projection import project
@@ -50,6 +51,19 @@ class SeenDepth(NamedTuple):
     """Of the frame, normalised, with the size of the depth."""
     inverse: Tensor
     """[h, w] inverse of the depth along z, normalised; 0 where it is unknown."""
+
+    def points(self) -> tuple[np.ndarray, np.ndarray]:
+        """Return the pixels [P, 2] with known depth, and their points [P, 3], normalised, row by row."""
+        inverse = self.inverse.numpy()
+        rows, columns = np.nonzero(inverse > 0)
+        pixels = np.stack([columns, rows], 1).astype(np.float64)
+        return pixels, self.points_at(pixels, inverse[rows, columns])
+
+    def points_at(self, pixels: np.ndarray, inverse: np.ndarray) -> np.ndarray:
+        """Return the points [P, 3], normalised, at pixels [P, 2] with inverse depths [P]."""
+        start, directions = ray_of(self.camera, pixels)
+        along = directions @ self.camera.viewmat[2, :3].double().numpy()
+        return start + directions / (inverse * along)[:, None]
 
 
 class FrameDepths(Protocol):

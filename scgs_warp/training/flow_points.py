@@ -20,6 +20,7 @@ from ..geometry.view_rays import pixels_of, ray_of
 from ..runtime.progress import progress
 from ..runtime.search_tree import search_tree
 from ..types import Camera
+from .clouds import LEAST_REGION, Cloud, colors_at, strays
 from .flow import Flows
 
 CANDIDATES = 12
@@ -41,10 +42,6 @@ LEFT = 0.008
 """Distance from where flow leads, as a share of the image's longer side, beyond which a point has moved."""
 AROUND_PIXEL, MAJORITY = 9, 0.6
 """Side of the square around a pixel, and the least share of its pixels that must move if the pixel does."""
-LEAST_REGION = 0.002
-"""Least share of the image that moves together."""
-CLOSE, STRAY = 8, 3.0
-"""Number of moving points around another, and the factor on the usual distance to them beyond which it is dropped."""
 NEARER, FARTHER = 0.2, 1.1
 """Range of plausible depths, as shares of the depth of the sparse points around the pixel: a mover stands before
 them."""
@@ -55,25 +52,7 @@ AROUND = 3
 """Number of sparse points nearest to a pixel; their median depth is used as that of the pixel's surroundings."""
 
 
-class InstantPoints(NamedTuple):
-    """Points of one instant, from a frame of a film or from the frames of several cameras."""
-
-    points: Tensor
-    """[P, 3] normalised."""
-    colors: Tensor
-    """[P, 3]"""
-    moves: Tensor
-    """[P] bool: known to move."""
-    time: float
-    later: Tensor | None = None
-    """[P, 3] where the points are at the time of the following cloud of a film; NaN where that is not known."""
-    frames: Tensor | None = None
-    """[P] int64, the frame in which each point is seen."""
-    pixels: Tensor | None = None
-    """[P, 2] where, at the size of the flow."""
-
-
-def flow_points(count: int, known: Tensor, data: Dataset, views: list[Camera]) -> InstantPoints | None:
+def flow_points(count: int, known: Tensor, data: Dataset, views: list[Camera]) -> Cloud | None:
     """Find up to ``count`` points of the frame in which flow tells most depths.
 
     Args:
@@ -102,14 +81,7 @@ def flow_points(count: int, known: Tensor, data: Dataset, views: list[Camera]) -
     points, pixels, moves = seen.points, seen.pixels, seen.moves
     chosen = _spread(moves, count)
     colors = colors_at(data[index].image, pixels[chosen].numpy(), flows.size(index))
-    return InstantPoints(points[chosen].float(), colors, moves[chosen], data.entries[index].time)
-
-
-def colors_at(image: Tensor, pixels: np.ndarray, size: tuple[int, int]) -> Tensor:
-    """Return the colours [P, 3] of an image [H, W, 3] at pixels [P, 2] of a reduced version of (width, height)."""
-    height, width = image.shape[:2]
-    columns, rows = ((pixels + 0.5) * (np.array([width, height]) / size)).astype(int).T
-    return image[rows.clip(0, height - 1), columns.clip(0, width - 1)]
+    return Cloud(points[chosen].float(), colors, moves[chosen], data.entries[index].time)
 
 
 def _spread(moves: Tensor, count: int) -> Tensor:
@@ -174,14 +146,6 @@ def _coherent(pixels: np.ndarray, moves: np.ndarray, shape: tuple[int, int]) -> 
     count, labels, stats, _ = cv2.connectedComponentsWithStats(most)
     large = [part for part in range(1, count) if stats[part, cv2.CC_STAT_AREA] >= LEAST_REGION * most.size]
     return np.isin(labels[rows, columns], large)
-
-
-def strays(points: np.ndarray) -> np.ndarray:
-    """Tell which of the points [P, 3] are far from others, [P] bool."""
-    if len(points) <= CLOSE:
-        return np.zeros(len(points), bool)
-    distances = search_tree(points).query(points, k=CLOSE + 1)[0][:, -1]
-    return distances > STRAY * np.median(distances)
 
 
 def _seen(index: int, known: Tensor, flows: Flows, views: list[Camera]) -> _Seen | None:

@@ -10,14 +10,15 @@ from torch import Tensor
 from ..data.dataset import Dataset
 from ..geometry.normalisation import FEWEST_POINTS, Normalisation
 from ..types import Camera
+from .clouds import Cloud
 from .depth import Depths
-from .depth_points import depth_clouds, on_movers
+from .depth_clouds import depth_clouds, on_movers
 from .flow import Flows, follow_each_other
-from .flow_points import InstantPoints, flow_points
+from .flow_points import flow_points
 from .registration import Registration
 from .start_motion import SeenMotion, start_cloud
+from .stereo_clouds import moving_points, stereo_clouds
 from .stereo_depth import StereoDepths, stereo_depths
-from .stereo_points import moving_points, stereo_clouds
 from .tracks import gather
 
 SHARE = 0.5
@@ -27,7 +28,7 @@ SHARE = 0.5
 class Movers(NamedTuple):
     """What is known of what moves before the first step."""
 
-    seen: InstantPoints
+    seen: Cloud
     """Points of one instant; none if nothing moves or no depth is found."""
     keep: Tensor
     """[P] bool, True for sparse points to keep. Of standing cameras, those on what moves are replaced, because they may
@@ -66,7 +67,7 @@ def points_on_movers(
         if found is None and len(known) < count:
             found = flow_points(min(most, count - len(known)), known, data, views)
     if found is None:
-        found = InstantPoints(torch.zeros(0, 3), torch.zeros(0, 3), torch.zeros(0, dtype=torch.bool), 0.0)
+        found = Cloud(torch.zeros(0, 3), torch.zeros(0, 3), torch.zeros(0, dtype=torch.bool), 0.0)
     return Movers(found, keep, motion, stereo)
 
 
@@ -77,7 +78,7 @@ def _kept(known: Tensor, rests: Tensor) -> Tensor:
 
 def _by_depth(
     most: int, data: Dataset, views: list[Camera], scale: float, seed: int
-) -> tuple[InstantPoints | None, SeenMotion | None]:
+) -> tuple[Cloud | None, SeenMotion | None]:
     """Find up to ``most`` points, and what depth maps show of their motion; None if nothing moves."""
     depths = Depths(data, views, scale)
     depths.read()
@@ -89,8 +90,8 @@ def _by_depth(
 
 
 def _gathered(
-    clouds: list[InstantPoints], most: int, seed: int, registration: Registration
-) -> tuple[InstantPoints | None, SeenMotion | None]:
+    clouds: list[Cloud], most: int, seed: int, registration: Registration
+) -> tuple[Cloud | None, SeenMotion | None]:
     """Gather the points of all clouds in the rest pose, up to ``most``; None if nothing moves."""
     if not clouds:
         return None, None

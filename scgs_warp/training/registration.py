@@ -15,10 +15,9 @@ from ..data.dataset import Dataset
 from ..geometry.optical_flow import at_targets, dense_flow, returns, targets_of, textured
 from ..geometry.view_rays import pixels_of
 from ..runtime.search_tree import search_tree
+from .clouds import Cloud
 from .depth import FrameDepths
-from .depth_points import placed
 from .flow import ROUND_TRIP, Flows, gray_at
-from .flow_points import InstantPoints
 
 SAME_DEPTH = 0.06
 """Largest relative difference between the expected depth of a point and that of the image, if the image shows it."""
@@ -46,7 +45,7 @@ class Registration:
         self._data, self._flows, self._depths, self._frame_then = data, flows, depths, frame_then
         self._grays: dict[int, np.ndarray] = {}
 
-    def places(self, cloud: InstantPoints, time: float, expected: np.ndarray) -> np.ndarray:
+    def places(self, cloud: Cloud, time: float, expected: np.ndarray) -> np.ndarray:
         """Return where the points of a cloud are at the time of another, [P, 3]; NaN where no image shows it.
 
         Args:
@@ -89,7 +88,7 @@ class Registration:
         found = targets[rows, columns].astype(np.float64)
         there_inverse = _sampled(inverse, found)
         good = shown & inside & sure[rows, columns] & (there_inverse > 0)
-        there[good] = placed(seen, found[good], there_inverse[good])
+        there[good] = seen.points_at(found[good], there_inverse[good])
         return there
 
     def _gray(self, index: int) -> np.ndarray:

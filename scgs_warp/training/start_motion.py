@@ -22,7 +22,7 @@ from ..optim import Adam, log_linear
 from ..runtime.progress import progress
 from ..runtime.search_tree import search_tree
 from ..seeding import Purpose, generator
-from .flow_points import InstantPoints
+from .clouds import Cloud
 from .tracks import Tracks
 
 STEPS = 600
@@ -46,7 +46,7 @@ NEIGHBORS, STIFF = 8, 0.05
 """Number of neighbours to which a point keeps its distance, and weight of this term."""
 
 
-def start_cloud(clouds: list[InstantPoints]) -> InstantPoints:
+def start_cloud(clouds: list[Cloud]) -> Cloud:
     """Choose the cloud nearest to the middle of the time; its pose is the rest pose."""
     return min(clouds, key=lambda cloud: abs(cloud.time - 0.5))
 
@@ -54,9 +54,9 @@ def start_cloud(clouds: list[InstantPoints]) -> InstantPoints:
 class SeenMotion(NamedTuple):
     """What is seen of the motion before the first step."""
 
-    source: InstantPoints
+    source: Cloud
     """Points of what moves, in the rest pose."""
-    clouds: list[InstantPoints]
+    clouds: list[Cloud]
     """Points at several moments, that of the source among them; normalised."""
     tracks: Tracks | None
     """Where the points of the source are at the time of each cloud, if that is known."""
@@ -134,7 +134,7 @@ class _Body:
 class _Target:
     """The points of one cloud, to which others are drawn."""
 
-    def __init__(self, seen: InstantPoints, seed: int, number: int) -> None:
+    def __init__(self, seen: Cloud, seed: int, number: int) -> None:
         self.chosen = torch.randperm(len(seen.points), generator=generator(seed, Purpose.CLOUD_POINTS, number))[:POINTS]
         self.points, self.colors = seen.points[self.chosen], seen.colors[self.chosen]
         self.size = float((self.points - self.points.median(0).values).norm(dim=1).median())

@@ -18,7 +18,7 @@ from torch import Tensor
 from ..runtime.progress import progress
 from ..runtime.search_tree import search_tree
 from ..seeding import Purpose, generator
-from .flow_points import InstantPoints
+from .clouds import Cloud
 from .registration import Registration
 
 AROUND = 16
@@ -57,12 +57,12 @@ class Tracks(NamedTuple):
 
 
 def gather(
-    clouds: list[InstantPoints],
+    clouds: list[Cloud],
     start: int,
     count: int,
     seed: int,
     registration: Registration | None = None,
-) -> tuple[InstantPoints | None, Tracks | None]:
+) -> tuple[Cloud | None, Tracks | None]:
     """Carry the points of all clouds to the pose of cloud ``start``, so that surfaces hidden then are there, too.
 
     Args:
@@ -111,14 +111,14 @@ def gather(
         return None, None
     some = some[torch.randperm(len(some), generator=generator(seed, Purpose.MOVING_POINTS, start))[:count]]
     moves = torch.ones(len(some), dtype=torch.bool)
-    everywhere = InstantPoints(gathered[some], torch.cat(colors)[some], moves, first.time)
+    everywhere = Cloud(gathered[some], torch.cat(colors)[some], moves, first.time)
     return everywhere, tracks.of(some)
 
 
 def follow(
     points: Tensor,
     start: int,
-    clouds: list[InstantPoints],
+    clouds: list[Cloud],
     unit: float,
     seen: Callable[[float, np.ndarray], np.ndarray] | None = None,
 ) -> Tracks | None:
@@ -149,7 +149,7 @@ def follow(
     return Tracks(places.float(), weights.float())
 
 
-def _pairs(cloud: InstantPoints) -> tuple[np.ndarray, np.ndarray] | None:
+def _pairs(cloud: Cloud) -> tuple[np.ndarray, np.ndarray] | None:
     """Return the tracked points of a cloud, and where they are at the next one, each [Q, 3], without outliers; None if
     there are too few."""
     if cloud.later is None:

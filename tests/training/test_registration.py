@@ -10,10 +10,9 @@ import torch
 from helpers.ball_and_wall import SIZE
 from scgs_warp.data.dataset import Dataset
 from scgs_warp.geometry.view_rays import pixels_of
+from scgs_warp.training.clouds import Cloud, frame_cloud
 from scgs_warp.training.depth import SeenDepth
-from scgs_warp.training.depth_points import placed, seen_points
 from scgs_warp.training.flow import Flows
-from scgs_warp.training.flow_points import InstantPoints
 from scgs_warp.training.registration import FARTHEST, Registration
 from scgs_warp.types import Camera, Frame
 
@@ -54,12 +53,12 @@ class Plane:
         return self.seen
 
 
-def cloud() -> InstantPoints:
+def cloud() -> Cloud:
     """Points of the first frame around its middle, every second pixel."""
     x, y = np.meshgrid(np.arange(50.0, 110, 2), np.arange(50.0, 110, 2))
     pixels = np.stack([x.ravel(), y.ravel()], 1)
-    points = placed(Plane().seen, pixels, np.full(len(pixels), 1.0 / DEPTH))
-    return seen_points(0, points, torch.zeros(len(pixels), 3), 0.0, pixels)
+    points = Plane().seen.points_at(pixels, np.full(len(pixels), 1.0 / DEPTH))
+    return frame_cloud(0, points, torch.zeros(len(pixels), 3), 0.0, pixels).cloud
 
 
 def registered(data: Dataset, wrong: tuple[float, float], depths: Plane | None = None) -> tuple[np.ndarray, np.ndarray]:
@@ -69,7 +68,7 @@ def registered(data: Dataset, wrong: tuple[float, float], depths: Plane | None =
     registration = Registration(data, Flows(data, [CAMERA] * 3), depths, lambda frame, time: round(2 * time))
     pixels = cloud().pixels.numpy() + SHIFT
     true, expected = (
-        placed(Plane().seen, pixels + off, np.full(len(pixels), 1.0 / DEPTH)) for off in ((0.0, 0.0), wrong)
+        Plane().seen.points_at(pixels + off, np.full(len(pixels), 1.0 / DEPTH)) for off in ((0.0, 0.0), wrong)
     )
     return registration.places(cloud(), 1.0, expected), true
 
@@ -97,7 +96,7 @@ def test_nothing_is_found_far_from_the_expected_places():
 
 
 def test_few_points_or_no_frame_find_nothing():
-    data, few = film(pattern(SHIFT)), InstantPoints(*(part[:20] for part in cloud()[:3]), 0.0)
+    data, few = film(pattern(SHIFT)), Cloud(*(part[:20] for part in cloud()[:3]), 0.0)
     few = few._replace(frames=torch.zeros(20, dtype=torch.int64), pixels=cloud().pixels[:20])
     flows = Flows(data, [CAMERA] * 3)
     expected = few.points.double().numpy()

@@ -9,7 +9,7 @@ import torch
 
 from helpers.tiny import tiny_config
 from scgs_warp.training import start_motion
-from scgs_warp.training.flow_points import InstantPoints
+from scgs_warp.training.clouds import Cloud
 from scgs_warp.training.initial_models import initial_motion
 from scgs_warp.training.start_motion import SeenMotion, _carried, _Target, learn_motion, start_cloud
 from scgs_warp.training.tracks import gather
@@ -39,17 +39,17 @@ def colors_of(points: torch.Tensor) -> torch.Tensor:
     return torch.stack([points[:, 0] * 2, (points[:, 1] > 0).float(), (points[:, 2] > 0).float()], 1)
 
 
-def clouds(times=TIMES) -> list[InstantPoints]:
+def clouds(times=TIMES) -> list[Cloud]:
     """Clouds in which each moment has lost another fifth of the points, as hidden parts are."""
     found = []
     for number, time in enumerate(times):
         kept = torch.arange(len(arm())) % 5 != number % 5
         points = turned(arm(), time)[kept]
-        found.append(InstantPoints(points, colors_of(arm())[kept], torch.ones(len(points)) > 0, time))
+        found.append(Cloud(points, colors_of(arm())[kept], torch.ones(len(points)) > 0, time))
     return found
 
 
-def seen_in(found: list[InstantPoints]) -> SeenMotion:
+def seen_in(found: list[Cloud]) -> SeenMotion:
     start = [cloud.time for cloud in found].index(start_cloud(found).time)
     source, tracks = gather(found, start, 1_500, 0)
     return SeenMotion(source, found, tracks)
@@ -71,7 +71,7 @@ def learnt():
 
 def carried(learnt, points: torch.Tensor, time: float) -> torch.Tensor:
     config, motion = learnt
-    seen = InstantPoints(points, colors_of(points), torch.ones(len(points)) > 0, 0.5)
+    seen = Cloud(points, colors_of(points), torch.ones(len(points)) > 0, 0.5)
     source = _Target(seen, 0, 0)
     source.points = points
     gaussians = _carried(source, torch.zeros(0, 3), config)
@@ -111,7 +111,7 @@ def test_two_runs_give_the_same_bits(learnt):
 def test_a_few_points_and_nothing_at_rest_suffice():
     config = tiny_config(40, motion={"nodes": 12})
     points = arm()[:12]
-    pair = [InstantPoints(points[:2] + t, points[:2], torch.ones(2) > 0, t) for t in (0.0, 1.0)]
+    pair = [Cloud(points[:2] + t, points[:2], torch.ones(2) > 0, t) for t in (0.0, 1.0)]
     motion = initial_motion(config, points, moves=torch.ones(12) > 0)
     learn_motion(motion, seen_in(pair), torch.zeros(0, 3), config)
     assert all(torch.isfinite(value).all() for value in motion.state_dict().values())
@@ -131,7 +131,7 @@ def test_tracks_show_what_nearest_points_cannot():
     for number, time in enumerate(times):
         later = turned(disc, times[number + 1]) if number < 6 else None
         points = turned(disc, time)
-        spinning.append(InstantPoints(points, torch.full_like(points, 0.5), torch.ones(500) > 0, time, later))
+        spinning.append(Cloud(points, torch.full_like(points, 0.5), torch.ones(500) > 0, time, later))
     config = tiny_config(40, motion={"nodes": 80, "width": 128, "layers": 6})
     errors = {}
     for name, seen in (("tracks", spinning), ("nearest", [cloud._replace(later=None) for cloud in spinning])):
@@ -149,7 +149,7 @@ def test_each_moment_has_its_steps(monkeypatch, moments, tracked, steps):
     seen = []
     for moment, (points, later) in enumerate(zip(at, [*at[1:], None])):
         time = moment / (moments - 1)
-        seen.append(InstantPoints(points, colors_of(arm()), torch.ones(500) > 0, time, later if tracked else None))
+        seen.append(Cloud(points, colors_of(arm()), torch.ones(500) > 0, time, later if tracked else None))
 
     class Begun(Exception):
         pass

@@ -17,7 +17,6 @@ from scgs_warp.data.dataset import Dataset
 from scgs_warp.errors import FrameError, UserError
 from scgs_warp.geometry.stereo import StereoPair
 from scgs_warp.training import stereo_depth
-from scgs_warp.training.depth_points import points_of
 from scgs_warp.training.frames import Frames
 from scgs_warp.training.state import TrainState
 from scgs_warp.training.view import prepare
@@ -41,7 +40,7 @@ def surfaces(film: Dataset, normalisation, depths, index: int) -> tuple[np.ndarr
     """Where the depth of a frame is known [h, w], and of the known pixels the distance of their points from the wall,
     and from the ball."""
     seen = depths.of(index)
-    points = points_of(seen)[1] / normalisation.scale + np.asarray(normalisation.centre)
+    points = seen.points()[1] / normalisation.scale + np.asarray(normalisation.centre)
     ball = np.linalg.norm(points - place_at(film.entries[index].time).double().numpy(), axis=1) - RADIUS
     return seen.inverse.numpy() > 0, np.abs(points[:, 1] - WALL), np.abs(ball)
 

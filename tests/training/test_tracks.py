@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from scgs_warp.training.flow_points import InstantPoints
+from scgs_warp.training.clouds import Cloud
 from scgs_warp.training.tracks import follow, gather
 
 MOMENTS = 9
@@ -29,7 +29,7 @@ def moved(points: torch.Tensor, moment: int) -> torch.Tensor:
     return points @ turn.T + torch.tensor([0.2, 0.1, 0.0]) * (moment - MOMENTS // 2)
 
 
-def clouds(missing: int | None = None) -> list[InstantPoints]:
+def clouds(missing: int | None = None) -> list[Cloud]:
     """At each moment only what is on one side of the box is seen, and a fifth of it has no track."""
     found = []
     for moment in range(MOMENTS):
@@ -40,7 +40,7 @@ def clouds(missing: int | None = None) -> list[InstantPoints]:
         later = torch.where(lost[:, None], NOWHERE, there[seen])
         last = moment in (missing, MOMENTS - 1)
         zeros = torch.zeros(int(seen.sum()), 3)
-        found.append(InstantPoints(here[seen], zeros, zeros[:, 0] == 0, moment / 8, None if last else later))
+        found.append(Cloud(here[seen], zeros, zeros[:, 0] == 0, moment / 8, None if last else later))
     return found
 
 
@@ -127,7 +127,7 @@ def test_what_rests_or_strays_is_not_gathered():
     for moment, cloud in enumerate(clouds()):
         points = torch.cat([cloud.points, wall, moved(far, moment)])
         later = None if cloud.later is None else torch.cat([cloud.later, wall, moved(far, moment + 1)])
-        wrong.append(InstantPoints(points, torch.zeros_like(points), points[:, 0] < 9, cloud.time, later))
+        wrong.append(Cloud(points, torch.zeros_like(points), points[:, 0] < 9, cloud.time, later))
     found, _ = gather(wrong, MOMENTS // 2, 10_000, 0)
     assert float(found.points[:, 1].max()) < 1.0 and float(found.points[:, 2].max()) < 1.0 and len(found.points) > 300
 

@@ -15,13 +15,14 @@ from helpers.tiny import tiny_config
 from scgs_warp.data.dataset import Dataset
 from scgs_warp.geometry.normalisation import Normalisation
 from scgs_warp.geometry.stereo import StereoPair
-from scgs_warp.training import stereo_depth, stereo_points
+from scgs_warp.training import stereo_clouds as module
+from scgs_warp.training import stereo_depth
 from scgs_warp.training.flow import Flows
 from scgs_warp.training.points_on_movers import points_on_movers
 from scgs_warp.training.standing_cameras import levels
 from scgs_warp.training.start_motion import start_cloud
 from scgs_warp.training.state import TrainState
-from scgs_warp.training.stereo_points import moving_points, stereo_clouds
+from scgs_warp.training.stereo_clouds import moving_points, stereo_clouds
 from scgs_warp.types import Camera
 
 
@@ -131,7 +132,7 @@ def test_points_of_a_large_rig_are_followed_in_some_films_only(film, monkeypatch
     measured = []
     path = Flows.between_frames
     monkeypatch.setattr(Flows, "between_frames", lambda self, *ends: measured.append(ends) or path(self, *ends))
-    monkeypatch.setattr(stereo_points, "MOST_FOLLOWED", 3 * MOMENTS)
+    monkeypatch.setattr(module, "MOST_FOLLOWED", 3 * MOMENTS)
     _, clouds = clouds_in(film)
     followed = [{one // MOMENTS for one, _ in measured if one % MOMENTS == moment} for moment in range(MOMENTS - 1)]
     assert all(len(cameras) <= 3 for cameras in followed) and max(map(len, followed)) == 3

@@ -7,7 +7,6 @@ elsewhere, in most of the pixels around it as well.
 from __future__ import annotations
 
 import itertools
-from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -15,14 +14,13 @@ import torch
 from torch import Tensor
 
 from ..data.dataset import Dataset, spread
-from ..geometry.optical_flow import targets_of
 from ..geometry.view_rays import pixels_of, ray_of
 from ..runtime.progress import progress
 from ..runtime.search_tree import search_tree
 from ..seeding import Purpose, generator
-from .depth import Depths, FrameDepths, SeenDepth
+from .clouds import LEAST_REGION, Cloud, FrameCloud, colors_at, frame_cloud, later_places, strays
+from .depth import Depths
 from .flow import Flows
-from .flow_points import LEAST_REGION, InstantPoints, colors_at, strays
 
 MOST_MOMENTS = 24
 """Largest number of moments at which points are sought."""
@@ -50,7 +48,7 @@ GHOST = 3.0
 """Distance to a moving point, in distances between neighbouring ones, up to which a sparse point lies on what moves."""
 
 
-def depth_clouds(count: int, data: Dataset, flows: Flows, depths: Depths, seed: int) -> list[InstantPoints]:
+def depth_clouds(count: int, data: Dataset, flows: Flows, depths: Depths, seed: int) -> list[Cloud]:
     """Find up to ``count`` moving points at each of several moments; moments without enough are left out."""
     found = []
     ordered = sorted(data.with_depth, key=lambda index: data.entries[index].time)
@@ -70,69 +68,18 @@ def depth_clouds(count: int, data: Dataset, flows: Flows, depths: Depths, seed: 
     return [each.cloud._replace(later=there) for each, there in zip(kept, [*later, None])]
 
 
-class FramePoints(NamedTuple):
-    """The moving points of a frame."""
-
-    index: int
-    cloud: InstantPoints
-    """With the pixels."""
-
-
-def _cloud(index: int, count: int, data: Dataset, flows: Flows, depths: Depths, seed: int) -> tuple[FramePoints, int]:
+def _cloud(index: int, count: int, data: Dataset, flows: Flows, depths: Depths, seed: int) -> tuple[FrameCloud, int]:
     """Find the moving points of a frame, up to ``count`` of them, chosen at random; and the number of all."""
     seen = depths.of(index)
     assert seen is not None, "asked for frames with a depth map only"
     inverse = seen.inverse.numpy()
-    pixels, points = points_of(seen)
+    pixels, points = seen.points()
     moves = _region(pixels, *_moves(index, points, pixels, flows), inverse)
     moves[moves] = ~strays(points[moves])
     every = moves.nonzero()[0]
     kept = every[torch.randperm(len(every), generator=generator(seed, Purpose.MOVING_POINTS, index))[:count].numpy()]
     colors = colors_at(data[index].image, pixels[kept], (inverse.shape[1], inverse.shape[0]))
-    cloud = seen_points(index, points[kept], colors, data.entries[index].time, pixels[kept])
-    return FramePoints(index, cloud), len(every)
-
-
-def seen_points(index: int, points: np.ndarray, colors: Tensor, time: float, pixels: np.ndarray) -> InstantPoints:
-    """Return moving points [P, 3] that a frame sees at pixels [P, 2]."""
-    frames, moves = torch.full((len(points),), index), torch.ones(len(points), dtype=torch.bool)
-    found = torch.from_numpy(points).float(), colors, moves, time
-    return InstantPoints(*found, frames=frames, pixels=torch.from_numpy(pixels))
-
-
-def points_of(seen: SeenDepth) -> tuple[np.ndarray, np.ndarray]:
-    """Return the pixels [P, 2] with known depth, and their points [P, 3], row by row."""
-    inverse = seen.inverse.numpy()
-    rows, columns = np.nonzero(inverse > 0)
-    pixels = np.stack([columns, rows], 1).astype(np.float64)
-    return pixels, placed(seen, pixels, inverse[rows, columns])
-
-
-def placed(seen: SeenDepth, pixels: np.ndarray, inverse: np.ndarray) -> np.ndarray:
-    """Return the points [P, 3] at pixels [P, 2] with inverse depths [P]."""
-    start, directions = ray_of(seen.camera, pixels)
-    along = directions @ seen.camera.viewmat[2, :3].double().numpy()
-    return start + directions / (inverse * along)[:, None]
-
-
-def later_places(one: FramePoints, following: int, flows: Flows, depths: FrameDepths) -> Tensor:
-    """Return where the points of a frame are in a later one, [P, 3]: at the depth of the pixel to which flow leads; NaN
-    where flow or depth is not known."""
-    assert one.cloud.pixels is not None, "seen by a frame"
-    pixels = one.cloud.pixels.numpy()
-    there = np.full((len(pixels), 3), np.nan)
-    path, seen = flows.between_frames(one.index, following), depths.of(following)
-    if path is None or seen is None:
-        return torch.from_numpy(there).float()
-    vectors, certain = flows.along(path)
-    columns, rows = pixels.astype(int).T
-    targets = targets_of(vectors)[rows, columns].astype(np.float64)
-    x, y = targets.round().astype(int).T
-    height, width = seen.inverse.shape
-    inverse = seen.inverse.numpy()[y.clip(0, height - 1), x.clip(0, width - 1)]
-    known = certain[rows, columns] & (inverse > 0) & (x >= 0) & (y >= 0) & (x < width) & (y < height)
-    there[known] = placed(seen, targets[known], inverse[known])
-    return torch.from_numpy(there).float()
+    return frame_cloud(index, points[kept], colors, data.entries[index].time, pixels[kept]), len(every)
 
 
 def _moves(index: int, points: np.ndarray, pixels: np.ndarray, flows: Flows) -> tuple[np.ndarray, np.ndarray]:
@@ -184,7 +131,7 @@ def _beside_nearer(inverse: np.ndarray) -> np.ndarray:
     return nearest * NEARER > inverse
 
 
-def on_movers(points: Tensor, clouds: list[InstantPoints]) -> Tensor:
+def on_movers(points: Tensor, clouds: list[Cloud]) -> Tensor:
     """Tell which sparse points [P, 3] lie where something that moves is at some moment, [P] bool."""
     near = np.zeros(len(points), bool)
     for cloud in clouds:

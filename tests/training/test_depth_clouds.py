@@ -15,12 +15,12 @@ from scgs_warp.data.dataset import Dataset
 from scgs_warp.gaussians import SH_C0
 from scgs_warp.geometry.normalisation import Normalisation
 from scgs_warp.rendering.render import render
-from scgs_warp.training import depth_points
+from scgs_warp.training import depth_clouds as depth_module
 from scgs_warp.training import points_on_movers as module
+from scgs_warp.training.clouds import Cloud
 from scgs_warp.training.depth import Depths
-from scgs_warp.training.depth_points import GHOST, depth_clouds, on_movers
+from scgs_warp.training.depth_clouds import GHOST, depth_clouds, on_movers
 from scgs_warp.training.flow import Flows
-from scgs_warp.training.flow_points import InstantPoints
 from scgs_warp.training.points_on_movers import points_on_movers
 from scgs_warp.training.state import TrainState
 
@@ -48,7 +48,7 @@ def film() -> Dataset:
     return with_depth(filmed(WALKS, place_at))
 
 
-def clouds_of(data: Dataset, count: int = 500) -> tuple[list[InstantPoints], Normalisation]:
+def clouds_of(data: Dataset, count: int = 500) -> tuple[list[Cloud], Normalisation]:
     normalisation = Normalisation.fit(data.cameras, data.points)
     views = [normalisation.apply_camera(camera) for camera in data.cameras]
     return depth_clouds(count, data, Flows(data, views), Depths(data, views, normalisation.scale), 0), normalisation
@@ -81,8 +81,8 @@ def test_points_are_followed_to_the_next_moment(film):
 def test_a_mover_that_goes_away_is_found_at_every_moment(film, monkeypatch):
     """It covers fewer and fewer pixels."""
     numbers = iter([*range(1000, 0, -40), 0, 0])
-    found = depth_points._cloud
-    monkeypatch.setattr(depth_points, "_cloud", lambda *arguments: (found(*arguments)[0], next(numbers)))
+    found = depth_module._cloud
+    monkeypatch.setattr(depth_module, "_cloud", lambda *arguments: (found(*arguments)[0], next(numbers)))
     moments = [cloud.time for cloud in clouds_of(film)[0]]
     assert moments == [entry.time for entry in film.entries][: len(moments)]
     assert len(moments) == 20, "those with 40 % of 520, the median"
@@ -132,7 +132,7 @@ def test_the_same_points_every_time_and_others_with_another_seed(film):
 
 def test_sparse_points_on_the_mover_are_ghosts():
     clouds = [
-        InstantPoints(torch.rand(200, 3, generator=torch.Generator().manual_seed(k)) + k, torch.zeros(200, 3),
+        Cloud(torch.rand(200, 3, generator=torch.Generator().manual_seed(k)) + k, torch.zeros(200, 3),
                       torch.ones(200, dtype=torch.bool), float(k))
         for k in (0, 1)
     ]  # fmt: skip

@@ -15,9 +15,8 @@ import torch
 from ..data.dataset import spread
 from ..runtime.progress import progress
 from ..seeding import Purpose, generator
-from .depth_points import FramePoints, later_places, points_of, seen_points
+from .clouds import Cloud, FrameCloud, colors_at, frame_cloud, later_places, strays
 from .flow import Flows
-from .flow_points import InstantPoints, colors_at, strays
 from .standing_cameras import StandingCamera
 from .stereo_depth import StereoDepths
 
@@ -46,12 +45,12 @@ def moving_points(
     return (seen >= 2) & (still <= seen // SEEING_PER_BLIND)
 
 
-def stereo_clouds(stereo: StereoDepths, flows: Flows, count: int, seed: int) -> list[InstantPoints]:
+def stereo_clouds(stereo: StereoDepths, flows: Flows, count: int, seed: int) -> list[Cloud]:
     """Find up to ``count`` moving points at each of several moments, from the first to the last; moments without enough
     are left out."""
     if sum(bool(one.moves.any()) for one in stereo.standing) < 2:
         return []
-    found: list[dict[int, FramePoints]] = []
+    found: list[dict[int, FrameCloud]] = []
     with progress(2 * len(stereo.moments), "points of what moves") as bar:
         for time in stereo.moments:
             found.append(_moment(time, stereo, count, seed))
@@ -73,8 +72,8 @@ def stereo_clouds(stereo: StereoDepths, flows: Flows, count: int, seed: int) -> 
 
 
 def _followed(
-    moment: dict[int, FramePoints], following: dict[int, FramePoints], stereo: StereoDepths
-) -> dict[int, FramePoints]:
+    moment: dict[int, FrameCloud], following: dict[int, FrameCloud], stereo: StereoDepths
+) -> dict[int, FrameCloud]:
     """Choose the cameras in whose films points are followed from a moment to the next: where movers have depth at both.
 
     Returns:
@@ -89,7 +88,7 @@ def _followed(
     return {able[place]: following[able[place]] for place in spread(len(able), max(2, most))}
 
 
-def _moment(time: float, stereo: StereoDepths, count: int, seed: int) -> dict[int, FramePoints]:
+def _moment(time: float, stereo: StereoDepths, count: int, seed: int) -> dict[int, FrameCloud]:
     """Find the moving points of a moment, up to ``count`` of them, chosen at random, by the number of the camera."""
     here = stereo.frames_at(time)
     views = [stereo.standing[number] for number in here]
@@ -98,7 +97,7 @@ def _moment(time: float, stereo: StereoDepths, count: int, seed: int) -> dict[in
     for one, region, index in zip(views, changed, here.values()):
         seen = stereo.of(index)
         assert seen is not None, "moments are those of pairs"
-        at, places = points_of(seen)
+        at, places = seen.points()
         moves = one.sees(places, region)[1]
         # What stands still behind a mover's path looks as usual.
         moves[moves] = moving_points(places[moves], views, changed)
@@ -115,17 +114,17 @@ def _moment(time: float, stereo: StereoDepths, count: int, seed: int) -> dict[in
         own = chosen & (owners == index)
         at = np.concatenate(pixels)[own]
         colors = colors_at(stereo.data[index].image, at, stereo.size(number))
-        found[number] = FramePoints(index, seen_points(index, every[own], colors, time, at))
+        found[number] = frame_cloud(index, every[own], colors, time, at)
     return found
 
 
-def _joined(moment: dict[int, FramePoints], time: float) -> InstantPoints:
+def _joined(moment: dict[int, FrameCloud], time: float) -> Cloud:
     parts = [each.cloud for each in moment.values()]
     names = "points", "colors", "moves", "frames", "pixels"
-    return InstantPoints(**{name: torch.cat([getattr(part, name) for part in parts]) for name in names}, time=time)
+    return Cloud(**{name: torch.cat([getattr(part, name) for part in parts]) for name in names}, time=time)
 
 
-def _later(one: FramePoints, two: FramePoints | None, flows: Flows, stereo: StereoDepths) -> torch.Tensor:
+def _later(one: FrameCloud, two: FrameCloud | None, flows: Flows, stereo: StereoDepths) -> torch.Tensor:
     """Return where the points of a frame are in its camera's frame of the next moment, [P, 3]; NaN where unknown."""
     if two is None or two.index == one.index or not len(one.cloud.points):
         return torch.full_like(one.cloud.points, torch.nan)
