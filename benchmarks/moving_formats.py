@@ -38,10 +38,10 @@ from scgs_warp.config.presets import to_dict
 from scgs_warp.edit import EditSession, edit_file, skeleton_file
 from scgs_warp.edit.rotations import conjugate, multiply, rotate
 from scgs_warp.export.gltf import upright
+from scgs_warp.export.moving import extent_of
 from scgs_warp.export.plain import plain_scene
 from scgs_warp.export.request import ExportRequest
 from scgs_warp.export.run import export
-from scgs_warp.export.skeleton import extent_of
 from scgs_warp.geometry.cameras import orbit_camera
 from scgs_warp.geometry.morton import morton_order
 from scgs_warp.runtime.environment import configure

@@ -14,9 +14,11 @@ from ..geometry.cameras import Overview, orbit_camera
 from ..runtime import memory
 from ..runtime.progress import progress
 from ..scene.scene import Scene
+from .finite import finite_rows
 from .fourdgs import KEYFRAME_EVERY, StillPart, View, write_fourdgs
+from .moments import AnimationMoment, posed_gaussians
 from .segments import Course
-from .skeleton import AnimationMoment, extent_of, finite_rows, posed_gaussians
+from .skeleton import extent_of
 from .tracks import build_tracks, read_points, write_tracks
 
 THINNEST = 1e-30

@@ -20,15 +20,9 @@ from ..edit.skeleton import Skeleton as Parts
 from ..errors import UserError
 from ..runtime import memory
 from ..types import Gaussians
-from .skeleton import (
-    AnimationMoment,
-    Skeleton,
-    continuous,
-    extent_of,
-    finite_rows,
-    posed_gaussians,
-    select_gaussians,
-)
+from .finite import finite_rows, select_gaussians
+from .moments import AnimationMoment, posed_gaussians
+from .skeleton import Skeleton, continuous, extent_of
 
 WIDTH = 4
 """Number of parts per Gaussian: what every player of glTF supports."""

@@ -28,7 +28,9 @@ from ..scene.scene import Scene
 from ..types import Gaussians
 from .cameras import write_cameras
 from .control_graph import write_graph
+from .finite import finite_rows, keep_finite, select_gaussians
 from .glb import write_glb
+from .moments import AnimationMoment, at_rest, even_moments, film_moments, posed_gaussians
 from .moving import export_fourdgs, export_tracks
 from .no_surface import explained
 from .npz import write_npz
@@ -37,18 +39,7 @@ from .plain import plain_scene
 from .poster import edited_poster
 from .request import FRAME_FORMATS, SEQUENCES, ExportRequest, check_request
 from .sequence import ENDINGS, check_folder, write_sequence
-from .skeleton import (
-    AnimationMoment,
-    Skeleton,
-    at_rest,
-    build_skeleton,
-    even_moments,
-    film_moments,
-    finite_rows,
-    keep_finite,
-    posed_gaussians,
-    select_gaussians,
-)
+from .skeleton import Skeleton, build_skeleton
 from .still import FILE_UP, check_reach, clipping, write_still
 
 if TYPE_CHECKING:

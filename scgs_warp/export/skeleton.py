@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -19,22 +18,11 @@ from ..edit.pose import compose, own_pose
 from ..errors import UserError
 from ..gaussians import GaussianParameters
 from ..runtime import memory
-from ..scene.scene import Scene
-from ..types import Gaussians, Pose
+from ..types import Pose
+from .moments import AnimationMoment
 
 JOINT_BYTES = 1600
 """Memory of a control point at a moment while a skeleton is built and written."""
-
-
-class AnimationMoment(NamedTuple):
-    """Times of one frame of an animation."""
-
-    seconds: float
-    """Time since the animation's beginning."""
-    time: float
-    """Scene time in [0, 1]."""
-    at: float | None = None
-    """Time in an edit's film in seconds."""
 
 
 @dataclass(frozen=True)
@@ -75,59 +63,6 @@ class Skeleton:
         """Restrict the binding to the Gaussians of ``rows`` [N] bool."""
         share = None if self.share is None else self.share[rows]
         return replace(self, indices=self.indices[rows], weights=self.weights[rows], share=share)
-
-
-def even_moments(frames: int, fps: float) -> list[AnimationMoment]:
-    """Return moments spaced evenly from scene time 0 to 1."""
-    return [AnimationMoment(frame / fps, frame / max(frames - 1, 1)) for frame in range(frames)]
-
-
-def film_moments(session: EditSession) -> list[AnimationMoment]:
-    """Return the moments of all frames of an edit's film."""
-    film = session.edit.film
-    seconds = np.arange(film.frames) / film.fps
-    times = session.edit.playback.times_at(seconds, film.seconds)
-    return [AnimationMoment(at, time, at) for at, time in zip(seconds.tolist(), times.tolist())]
-
-
-def posed_gaussians(scene: Scene, session: EditSession | None, moment: AnimationMoment) -> Gaussians:
-    """Return activated Gaussians, world units, with the session's edit applied if there is a session."""
-    if session is None:
-        return scene.gaussians_at(moment.time)
-    return session.gaussians_at(moment.time, moment.at)
-
-
-@torch.no_grad()
-def at_rest(scene: Scene) -> Gaussians:
-    """Return activated Gaussians before any motion, world units."""
-    rest, undo = scene.gaussians.activate(), scene.normalisation
-    return replace(rest, means=undo.undo(rest.means), scales=undo.undo_scale(rest.scales))
-
-
-def finite_rows(gaussians: Gaussians) -> np.ndarray:
-    """Return [N] bool: Gaussians that are finite and whose quaternion is not zero."""
-    count = len(gaussians.means)
-    parts = [part.detach().reshape(count, -1).isfinite().all(dim=1) for part in gaussians.tensors().values()]
-    return (torch.stack(parts).all(dim=0) & gaussians.quats.any(dim=1)).cpu().numpy()
-
-
-def select_gaussians(gaussians: Gaussians, rows: np.ndarray) -> Gaussians:
-    """Return the Gaussians of ``rows`` [N] bool, on the CPU."""
-    chosen = torch.from_numpy(rows)
-    rows_of = {name: value.detach().cpu()[chosen] for name, value in gaussians.tensors().items()}
-    return replace(gaussians, **rows_of)
-
-
-def keep_finite(gaussians: Gaussians) -> Gaussians:
-    """Return the finite Gaussians, on the CPU.
-
-    Raises:
-        UserError: no Gaussian is finite.
-    """
-    rows = finite_rows(gaussians)
-    if not rows.any():
-        raise UserError(f"none of {len(rows)} Gaussians is finite; train again with a lower rate")
-    return select_gaussians(gaussians, rows)
 
 
 def extent_of(points: np.ndarray) -> float:

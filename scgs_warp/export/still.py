@@ -11,10 +11,10 @@ from ..formats.gaussian_files import write_gaussians
 from ..formats.gaussian_spz import check_positions
 from ..geometry.axes import Axis, direction
 from ..types import Gaussians
+from .finite import keep_finite
 from .glb import write_glb
 from .plain import at_once, plain_scene
 from .request import output_suffix
-from .skeleton import keep_finite
 
 FILE_UP: Axis = "-y"
 """Up direction of Gaussians from files, which do not state it."""

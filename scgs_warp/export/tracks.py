@@ -21,10 +21,11 @@ from ..runtime import memory
 from ..runtime.search_tree import search_tree
 from ..scene.scene import Scene
 from ..storage.files import read_bytes, write_atomically
+from .finite import finite_rows
 from .gltf import VERTICES, GltfDocument, linear_colors, upright
+from .moments import AnimationMoment, posed_gaussians
 from .no_surface import NoSurface
 from .request import MAX_POINTS
-from .skeleton import AnimationMoment, finite_rows, posed_gaussians
 
 FORMAT = "scgs-warp tracks"
 VERSION = 1

@@ -10,7 +10,8 @@ from helpers.edit_sessions import TURN, part
 from helpers.export_files import gltf_arrays
 from scgs_warp.edit import EditSession
 from scgs_warp.export.control_graph import write_graph
-from scgs_warp.export.skeleton import build_skeleton, even_moments
+from scgs_warp.export.moments import even_moments
+from scgs_warp.export.skeleton import build_skeleton
 
 
 def test_every_control_point_is_an_octahedron_and_every_edge_a_bar(tmp_path):

@@ -13,9 +13,10 @@ from helpers.edit_scenes import bar_scene, tinted_scene
 from scgs_warp.edit import EditSession
 from scgs_warp.errors import UserError
 from scgs_warp.export import segments as parts
+from scgs_warp.export.moments import even_moments
 from scgs_warp.export.moving import export_fourdgs
 from scgs_warp.export.segments import Course, segments
-from scgs_warp.export.skeleton import even_moments, extent_of
+from scgs_warp.export.skeleton import extent_of
 from scgs_warp.gaussians import SH_C0
 from scgs_warp.scene.scene import Scene
 from scgs_warp.types import Gaussians

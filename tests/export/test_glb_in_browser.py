@@ -20,8 +20,9 @@ from scgs_warp.export.gltf import upright
 from scgs_warp.export.mesh.binding import bind, posed
 from scgs_warp.export.mesh.files import write_mesh
 from scgs_warp.export.mesh.surface import Surface
+from scgs_warp.export.moments import at_rest, even_moments
 from scgs_warp.export.part_rig import build_rig
-from scgs_warp.export.skeleton import at_rest, build_skeleton, even_moments
+from scgs_warp.export.skeleton import build_skeleton
 from scgs_warp.export.still import write_still
 from scgs_warp.export.tracks import build_tracks, write_tracks
 from scgs_warp.gaussians import SH_C0

@@ -6,8 +6,9 @@ import numpy as np
 
 from helpers.edit_scenes import bar_scene
 from scgs_warp.edit import EditSession
+from scgs_warp.export.moments import at_rest, even_moments
 from scgs_warp.export.npz import FORMAT, VERSION, write_npz
-from scgs_warp.export.skeleton import at_rest, build_skeleton, even_moments
+from scgs_warp.export.skeleton import build_skeleton
 
 
 def test_arrays_are_those_of_the_skeleton_and_the_same_every_time(tmp_path):

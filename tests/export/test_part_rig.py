@@ -14,8 +14,8 @@ from helpers.node_packages import gltf_errors
 from scgs_warp.edit import EditSession
 from scgs_warp.edit.rotations import multiply, rotate
 from scgs_warp.export.glb import write_glb
+from scgs_warp.export.moments import even_moments, film_moments
 from scgs_warp.export.part_rig import Rig, build_rig, part_weights
-from scgs_warp.export.skeleton import even_moments, film_moments
 from scgs_warp.scene.scene import Scene
 
 FRAMES = 5

@@ -25,7 +25,8 @@ from scgs_warp.apps import view as view_app
 from scgs_warp.edit import EditSession
 from scgs_warp.edit.rotations import from_axis, unit
 from scgs_warp.export.control_graph import write_graph
-from scgs_warp.export.skeleton import at_rest, build_skeleton, even_moments
+from scgs_warp.export.moments import at_rest, even_moments
+from scgs_warp.export.skeleton import build_skeleton
 from scgs_warp.export.still import write_still
 from scgs_warp.scene.from_gaussians import open_gaussians
 from scgs_warp.scene.scene import Scene

@@ -9,8 +9,8 @@ import pytest
 
 from helpers.edit_scenes import bar_scene
 from scgs_warp.errors import UserError
+from scgs_warp.export.moments import at_rest
 from scgs_warp.export.sequence import write_sequence
-from scgs_warp.export.skeleton import at_rest
 from scgs_warp.types import Gaussians
 
 

@@ -9,7 +9,8 @@ from helpers.edit_scenes import bar_scene
 from scgs_warp.edit import EditSession
 from scgs_warp.edit.rotations import from_axis, rotate
 from scgs_warp.errors import UserError
-from scgs_warp.export.skeleton import Skeleton, at_rest, build_skeleton, even_moments
+from scgs_warp.export.moments import at_rest, even_moments
+from scgs_warp.export.skeleton import Skeleton, build_skeleton
 from scgs_warp.scene.scene import Scene
 
 TIMES = (0.0, 0.5, 1.0)

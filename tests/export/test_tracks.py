@@ -13,7 +13,7 @@ from helpers.export_files import gltf_arrays
 from helpers.node_packages import gltf_errors
 from scgs_warp.edit.rotations import conjugate, multiply, rotate, unit
 from scgs_warp.errors import UserError
-from scgs_warp.export.skeleton import even_moments
+from scgs_warp.export.moments import even_moments
 from scgs_warp.export.tracks import POINT_BYTES, build_tracks, read_points, write_tracks
 from scgs_warp.runtime import memory
 from scgs_warp.scene.scene import Scene

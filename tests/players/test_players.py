@@ -26,8 +26,9 @@ from scgs_warp.edit import EditSession
 from scgs_warp.edit.rotations import rotate, unit
 from scgs_warp.export.glb import write_glb
 from scgs_warp.export.gltf import upright
+from scgs_warp.export.moments import at_rest, even_moments
 from scgs_warp.export.part_rig import build_rig
-from scgs_warp.export.skeleton import at_rest, build_skeleton, even_moments
+from scgs_warp.export.skeleton import build_skeleton
 from scgs_warp.scene.scene import Scene
 
 PLAYERS = ROOT / "examples" / "players"

@@ -15,7 +15,9 @@ from ...edit import EditSession
 from ...runtime.progress import progress
 from ...scene.scene import Scene
 from ...types import Gaussians
-from ..skeleton import AnimationMoment, Skeleton, build_skeleton, finite_rows
+from ..finite import finite_rows
+from ..moments import AnimationMoment
+from ..skeleton import Skeleton, build_skeleton
 from .binding import SAMPLES, bind, clearest_frame, posed, sample_frames
 from .cleaning import clean
 from .colors import VIEWS as COLOR_VIEWS

@@ -19,7 +19,8 @@ from scgs_warp.edit import EditSession
 from scgs_warp.export.mesh import colors, surface
 from scgs_warp.export.mesh.binding import clearest_frame
 from scgs_warp.export.mesh.job import MeshJob, MeshSettings
-from scgs_warp.export.skeleton import build_skeleton, even_moments
+from scgs_warp.export.moments import even_moments
+from scgs_warp.export.skeleton import build_skeleton
 from scgs_warp.formats.gaussian_ply import write_gaussian_ply
 from scgs_warp.storage import checkpoint
 
