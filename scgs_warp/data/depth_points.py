@@ -11,6 +11,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
+from ..geometry.pinhole import projected
 from ..types import Camera
 from .dataset import Dataset, spread
 from .depth_cloud import depth_cloud
@@ -81,11 +82,9 @@ def _agree(clouds: list[_Cloud]) -> bool:
 def _differences(before: _Cloud, after: _Cloud) -> np.ndarray:
     """Return the relative differences [Q] of depth at the points of ``before`` that ``after`` sees."""
     camera, (height, width) = after.camera, after.depth.shape
-    local = torch.from_numpy(before.points).float() @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
-    local = local[local[:, 2] > 0]
-    pixels = local @ camera.K.T / local[:, 2:]
+    pixels, local = projected(torch.from_numpy(before.points).float(), camera)
     columns, rows = (pixels[:, 0] * width / camera.width).floor(), (pixels[:, 1] * height / camera.height).floor()
-    inside = (columns >= 0) & (columns < width) & (rows >= 0) & (rows < height)
+    inside = (local[:, 2] > 0) & (columns >= 0) & (columns < width) & (rows >= 0) & (rows < height)
     depth = after.depth[rows[inside].long(), columns[inside].long()]
     known = depth > 0
     return (local[inside, 2][known] / depth[known] - 1.0).abs().numpy()

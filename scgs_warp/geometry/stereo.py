@@ -10,7 +10,7 @@ import cv2
 import numpy as np
 
 from ..types import Camera
-from .view_rays import pixels_of
+from .pinhole import pixels_of
 
 ENLARGED, LARGEST_SIDE = 2.0, 1280
 """Factor by which images are enlarged for matching, because disparities are whole pixels at first; and the longer side

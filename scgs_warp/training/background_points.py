@@ -11,27 +11,20 @@ from torch import Tensor
 
 from ..data.dataset import spread
 from ..geometry.normalisation import Normalisation
+from ..geometry.pinhole import in_image, projected
 from ..runtime.search_tree import search_tree
 from ..seeding import Purpose, generator
-from ..types import Camera, Frame
+from ..types import Frame
 
 MOST_VIEWS = 100
 """Largest number of frames through which rays are cast."""
 NEAREST = 3
 """Number of projected points nearest to a pixel; their median depth is used as that of the pixel."""
+NEAREST_DEPTH = 1e-3
+"""Depth, normalised, up to which a sparse point tells nothing."""
 FARTHEST = 1.5
 """Largest ratio of a point's depth to that of nearby texture. The ratio is at least 1, because surfaces without texture
 lie behind texture."""
-
-
-def _project(points: Tensor, camera: Camera) -> tuple[Tensor, Tensor]:
-    """Project points [P, 3]: return the pixels [Q, 2] and depths [Q] of those inside the camera's image."""
-    local = points @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
-    local = local[local[:, 2] > 1e-3]
-    pixels = local @ camera.K.T
-    pixels = pixels[:, :2] / pixels[:, 2:]
-    inside = ((pixels >= 0) & (pixels < pixels.new_tensor([camera.width, camera.height]))).all(1)
-    return pixels[inside], local[inside, 2]
 
 
 def _valid_cells(count: int, frame: Frame, random: torch.Generator) -> Tensor:
@@ -66,7 +59,9 @@ def background_points(
         frame = data[index]
         share = count * (ray_set + 1) // len(chosen) - count * ray_set // len(chosen)
         camera = normalisation.apply_camera(frame.camera).to("cpu")
-        known, depths = _project(points.cpu(), camera)
+        known, local = projected(points.cpu(), camera)
+        inside = in_image(known, local, camera, NEAREST_DEPTH)
+        known, depths = known[inside], local[inside, 2]
         if share == 0 or len(known) == 0:
             continue
         random = generator(seed, Purpose.BACKGROUND_POINTS, ray_set)

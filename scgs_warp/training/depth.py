@@ -19,7 +19,7 @@ from ..config.presets import TrainConfig
 from ..data.dataset import Dataset
 from ..errors import FrameError, UserError
 from ..geometry.cameras import scaled_camera
-from ..geometry.view_rays import ray_of
+from ..geometry.pinhole import ray_of
 from ..ops.binning import bin_splats
 from ..ops.compositing import composite
 from ..ops.projection import project

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from ..data.dataset import Dataset, spread
-from ..geometry.view_rays import pixels_of, ray_of
+from ..geometry.pinhole import pixels_of, ray_of
 from ..runtime.progress import progress
 from ..runtime.search_tree import search_tree
 from ..seeding import Purpose, generator

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from ..data.dataset import Dataset, spread
 from ..geometry.optical_flow import targets_of
-from ..geometry.view_rays import pixels_of, ray_of
+from ..geometry.pinhole import pixels_of, ray_of
 from ..runtime.progress import progress
 from ..runtime.search_tree import search_tree
 from ..types import Camera

@@ -11,6 +11,7 @@ from torch import Tensor
 from ..config.presets import TrainConfig
 from ..data.dataset import Dataset, spread
 from ..geometry.normalisation import Normalisation
+from ..geometry.pinhole import in_image, projected
 from ..seeding import Purpose, generator
 from ..types import Camera
 from .automatic import has_initial_points
@@ -127,12 +128,9 @@ def coverage(points: Tensor, data: Dataset, normalisation: Normalisation) -> Cov
 
 def _pixels(points: Tensor, camera: Camera) -> tuple[Tensor, Tensor, Tensor]:
     """Project points [P, 3] to pixels: return their rows [P] and columns [P], and [P] bool: inside the image."""
-    camera = camera.to("cpu")
-    local = points @ camera.viewmat[:3, :3].T + camera.viewmat[:3, 3]
-    pixels = local @ camera.K.T
-    column = (pixels[:, 0] / pixels[:, 2]).floor().long()
-    row = (pixels[:, 1] / pixels[:, 2]).floor().long()
-    inside = (local[:, 2] > 0) & (column >= 0) & (column < camera.width) & (row >= 0) & (row < camera.height)
+    pixels, local = projected(points, camera)
+    inside = in_image(pixels, local, camera)
+    column, row = pixels.floor().long().unbind(1)
     return row.clamp(0, camera.height - 1), column.clamp(0, camera.width - 1), inside
 
 

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from ..data.dataset import Dataset, spread
 from ..geometry.normalisation import COMMON_RADIUS, FEWEST_POINTS, Normalisation
+from ..geometry.pinhole import in_image, projected
 from ..types import Camera
 
 MOST_VIEWS = 200
@@ -57,11 +58,8 @@ def _distances(data: Dataset, normalisation: Normalisation, cameras: list[Camera
     assert data.points is not None, "the caller has looked"
     points, found = normalisation.apply(data.points).double(), []
     for camera in cameras:
-        local = points @ camera.viewmat[:3, :3].double().T + camera.viewmat[:3, 3].double()
-        local = local[local[:, 2] > 0]
-        pixels = local @ camera.K.double().T
-        pixels = pixels[:, :2] / pixels[:, 2:]
-        inside = ((pixels >= 0) & (pixels < pixels.new_tensor([camera.width, camera.height]))).all(1)
+        pixels, local = projected(points, camera)
+        inside = in_image(pixels, local, camera)
         if int(inside.sum()) >= FEWEST_POINTS:
             found.append(local[inside].norm(dim=1))
     return found

@@ -13,7 +13,7 @@ import numpy as np
 
 from ..data.dataset import Dataset
 from ..geometry.optical_flow import at_targets, dense_flow, returns, targets_of, textured
-from ..geometry.view_rays import pixels_of
+from ..geometry.pinhole import pixels_of
 from ..runtime.search_tree import search_tree
 from .clouds import Cloud
 from .depth import FrameDepths

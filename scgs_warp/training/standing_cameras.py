@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from ..data.dataset import Dataset, spread
-from ..geometry.view_rays import pixels_of
+from ..geometry.pinhole import pixels_of
 from ..runtime.progress import progress
 from ..types import Camera, Frame
 

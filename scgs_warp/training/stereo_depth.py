@@ -17,8 +17,8 @@ from ..data.dataset import Dataset, spread
 from ..errors import FrameError, UserError
 from ..geometry.cameras import scaled_camera
 from ..geometry.normalisation import Normalisation
+from ..geometry.pinhole import pixels_of
 from ..geometry.stereo import stereo_pairs
-from ..geometry.view_rays import pixels_of
 from ..runtime.progress import progress
 from ..types import Camera, Frame
 from .depth import SeenDepth, seen_depth

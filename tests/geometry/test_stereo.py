@@ -8,8 +8,8 @@ import pytest
 import torch
 
 from helpers import textured_corner as corner
+from scgs_warp.geometry.pinhole import pixels_of
 from scgs_warp.geometry.stereo import StereoPair
-from scgs_warp.geometry.view_rays import pixels_of
 from scgs_warp.types import Camera
 
 ALL = np.ones((corner.HEIGHT, corner.WIDTH), bool)

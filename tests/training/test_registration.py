@@ -9,7 +9,7 @@ import torch
 
 from helpers.ball_and_wall import SIZE
 from scgs_warp.data.dataset import Dataset
-from scgs_warp.geometry.view_rays import pixels_of
+from scgs_warp.geometry.pinhole import pixels_of
 from scgs_warp.training.clouds import Cloud, frame_cloud
 from scgs_warp.training.depth import SeenDepth
 from scgs_warp.training.flow import Flows

@@ -19,8 +19,8 @@ import numpy as np
 import torch
 
 from ...geometry.optical_flow import at_targets, dense_flow, returns, targets_of, textured
+from ...geometry.pinhole import pixels_of, ray_of
 from ...geometry.stereo import StereoPair, stereo_pairs
-from ...geometry.view_rays import pixels_of, ray_of
 from ...types import Camera
 from ..bundle_adjustment import median_error
 from ..colmap import quiet, read_model, write_model

@@ -12,7 +12,7 @@ from scgs_warp.capture.colmap import quiet
 from scgs_warp.capture.rig import adjustment
 from scgs_warp.capture.rig.cameras import read_solution, solution_of
 from scgs_warp.geometry import stereo
-from scgs_warp.geometry.view_rays import pixels_of
+from scgs_warp.geometry.pinhole import pixels_of
 
 LENSES = {"straight": 0.0, "bent": -0.12}
 
