@@ -217,7 +217,7 @@ def load_of(gaussians: Gaussians, camera: Camera, antialiased: bool = False) -> 
     return Load(len(tiles.splats), mean, int(covered.sum()))
 
 
-def training_data(scene: Scene, size: Size, seed: int = SEED) -> Dataset:
+def training_data(scene: Scene, size: Size) -> Dataset:
     """Render images of the scene from several sides and add noise, so that the gradient of the loss reaches all
     parameters."""
     frames = []
@@ -226,7 +226,7 @@ def training_data(scene: Scene, size: Size, seed: int = SEED) -> Dataset:
         camera = scene_camera(scene, size, 30.0 * index)
         image = scene.render(camera, time)
         planar = image.rgb.permute(2, 0, 1).cpu()
-        noise = 0.05 * torch.randn(planar.shape, generator=generator(seed, 3, index))
+        noise = 0.05 * torch.randn(planar.shape, generator=generator(SEED, 3, index))
         planar = (planar + noise * (image.alpha.cpu() > 0)).clamp(0.0, 1.0)
         frames.append(Frame(camera.to("cpu"), time, planar.permute(1, 2, 0), name=f"{index}"))
     return Dataset(frames, folder=Path("synthetic"), split="train", background=_background(scene))

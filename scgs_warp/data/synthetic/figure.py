@@ -14,7 +14,7 @@ from .solids import Vector, rounded_box, torus
 from .surface import Material, PartMesh, Piece, merge, placed
 
 CREAM, WHITE = (0.97, 0.90, 0.76), (0.97, 0.96, 0.92)
-CORAL, RED, PINK = (0.96, 0.44, 0.32), (0.82, 0.19, 0.22), (0.97, 0.62, 0.60)
+CORAL, RED = (0.96, 0.44, 0.32), (0.82, 0.19, 0.22)
 TEAL, MINT, NAVY = (0.10, 0.56, 0.60), (0.56, 0.85, 0.76), (0.13, 0.18, 0.36)
 MUSTARD, GLOW, BROWN = (0.97, 0.74, 0.22), (0.62, 0.98, 0.95), (0.45, 0.27, 0.19)
 STEEL = (0.62, 0.68, 0.76)
