@@ -97,7 +97,7 @@ def _rows(
     }
     picture_stages = {
         **solve,
-        "skin": [(engine, "pose_gaussians")],
+        "skin": [(engine, "edited_gaussians")],
         **draw_stages(render),
         "bytes": [(pictures, "to_bytes")],
         "encode": [(pictures, "_jpeg"), (poses, "picture_message")],

@@ -28,7 +28,7 @@ from .keyframes import targets_at
 from .part_pose import PartMove, PartPoser
 from .part_skin import PartSkin, part_skin
 from .player import Player
-from .pose import MotionPose, NodePose, Rig, motion_pose, pose_gaussians
+from .pose import MotionPose, NodePose, Rig, edited_gaussians, motion_pose
 from .rotations import from_matrix, slerp, unit
 from .skeleton import Skeleton
 from .solver import STEP_ITERATIONS, ArapSolver, Shape, count_steps
@@ -221,10 +221,10 @@ class Engine:
         model = self.rig, self.scene.gaussians, self.motion_at(time)
         if bent.base is None or bent.skin is None:
             self._under = None
-            return pose_gaussians(*model, bent, self.binding, masked)
+            return edited_gaussians(*model, bent, self.binding, masked)
         if self._under is None or self._under[0] != time or self._under[1] is not bent.base:
-            self._under = time, bent.base, pose_gaussians(*model, bent.base, self.binding, masked)
-        return pose_gaussians(*model, bent, self.binding, masked, self._under[2])
+            self._under = time, bent.base, edited_gaussians(*model, bent.base, self.binding, masked)
+        return edited_gaussians(*model, bent, self.binding, masked, self._under[2])
 
     def _unbent(self, edit: Edit, time: float) -> NodePose | None:
         base = self.base_at(edit, time)

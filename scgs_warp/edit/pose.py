@@ -111,7 +111,7 @@ def own_pose(motion: MotionPose, bent: NodePose) -> Pose | None:
 
 
 @torch.no_grad()
-def pose_gaussians(
+def edited_gaussians(
     rig: Rig,
     gaussians: GaussianParameters,
     motion: MotionPose,
@@ -134,7 +134,7 @@ def pose_gaussians(
         under: Gaussians under ``bent.base``, if they are known.
     """
     if bent.base is not None and (masked or bent.skin is not None):
-        posed = under or pose_gaussians(rig, gaussians, motion, bent.base, binding, masked)
+        posed = under or edited_gaussians(rig, gaussians, motion, bent.base, binding, masked)
         if bent.skin is not None:
             return _with_parts(posed, bent, bent.base, bent.skin)
         return _on_top(posed, gaussians, bent, bent.base, binding)

@@ -1,7 +1,7 @@
 """Clouds: points of what moves, each cloud of one instant, and what the ways to find them share.
 
-``stereo_clouds`` finds them before the standing cameras of a rig, ``depth_clouds`` in a film with depth maps, and
-``flow_points`` a single one in a film without.
+``movers_by_stereo`` finds them before the standing cameras of a rig, ``movers_by_depth`` in a film with depth maps, and
+``movers_by_flow`` a single one in a film without; ``points_on_movers`` chooses between them.
 """
 
 from __future__ import annotations

@@ -12,12 +12,12 @@ from ..geometry.normalisation import FEWEST_POINTS, Normalisation
 from ..types import Camera
 from .clouds import Cloud
 from .depth import Depths
-from .depth_clouds import depth_clouds, on_movers
 from .flow import Flows, follow_each_other
-from .flow_points import flow_points
+from .movers_by_depth import depth_clouds, on_movers
+from .movers_by_flow import flow_cloud
+from .movers_by_stereo import moving_points, stereo_clouds
 from .registration import Registration
 from .start_motion import SeenMotion, start_cloud
-from .stereo_clouds import moving_points, stereo_clouds
 from .stereo_depth import StereoDepths, stereo_depths
 from .tracks import gather
 
@@ -65,7 +65,7 @@ def points_on_movers(
             found, motion = _by_depth(min(most, int(SHARE * count)), data, views, normalisation.scale, seed)
             keep = keep if motion is None else _kept(known, ~on_movers(known, motion.clouds))
         if found is None and len(known) < count:
-            found = flow_points(min(most, count - len(known)), known, data, views)
+            found = flow_cloud(min(most, count - len(known)), known, data, views)
     if found is None:
         found = Cloud(torch.zeros(0, 3), torch.zeros(0, 3), torch.zeros(0, dtype=torch.bool), 0.0)
     return Movers(found, keep, motion, stereo)

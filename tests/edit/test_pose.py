@@ -9,7 +9,7 @@ import torch
 from helpers.edit_scenes import bar_scene, tinted_scene
 from helpers.edit_sessions import TURN, part, same
 from scgs_warp.edit import Edit, EditSession, Hold
-from scgs_warp.edit.pose import NodePose, pose_gaussians
+from scgs_warp.edit.pose import NodePose, edited_gaussians
 from scgs_warp.edit.rotations import from_axis, multiply, rotate, to_matrix
 from scgs_warp.ops.harmonics_rotation import rotate_harmonics
 
@@ -23,7 +23,7 @@ def test_with_a_mask_holds_turn_colours_as_far_as_gaussians():
     turns = np.tile(turn, (len(everything), 1))
     bent = NodePose(rotate(turn, rest), turns, turns)
     engine = session.engine
-    posed = pose_gaussians(engine.rig, scene.gaussians, engine.motion_at(0.0), bent, engine.binding, True)
+    posed = edited_gaussians(engine.rig, scene.gaussians, engine.motion_at(0.0), bent, engine.binding, True)
     before = torch.nn.functional.normalize(scene.gaussians.quats.detach().double(), dim=1)
     after = torch.nn.functional.normalize(posed.quats.double(), dim=1)
     own = multiply(after.numpy(), before.numpy() * [1, -1, -1, -1])

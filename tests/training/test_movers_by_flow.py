@@ -11,7 +11,7 @@ from helpers.ball_and_wall import SIZE, ball, filmed, walking_camera
 from helpers.tiny import tiny_config, tiny_dataset
 from scgs_warp.data.dataset import Dataset
 from scgs_warp.geometry.normalisation import Normalisation
-from scgs_warp.training.flow_points import flow_points
+from scgs_warp.training.movers_by_flow import flow_cloud
 from scgs_warp.training.state import TrainState
 
 COUNT = 30
@@ -32,7 +32,7 @@ def film() -> Dataset:
 def found_in(film: Dataset, count: int = 1000):
     normalisation = Normalisation.fit(film.cameras, film.points)
     views = [normalisation.apply_camera(camera) for camera in film.cameras]
-    found = flow_points(count, normalisation.apply(film.points).float(), film, views)
+    found = flow_cloud(count, normalisation.apply(film.points).float(), film, views)
     assert found is not None
     places = found.points.double() / normalisation.scale + torch.as_tensor(normalisation.centre)
     return found, places
@@ -69,21 +69,21 @@ def test_cameras_that_rest_give_none(film):
     still = film.with_cameras([film.cameras[0]] * len(film))
     normalisation = Normalisation.fit(film.cameras, film.points)
     views = [normalisation.apply_camera(camera) for camera in still.cameras]
-    assert flow_points(100, normalisation.apply(film.points).float(), still, views) is None
+    assert flow_cloud(100, normalisation.apply(film.points).float(), still, views) is None
 
 
 def test_a_mover_that_has_sparse_points_needs_no_others(film):
     points = torch.cat([film.points, ball(place_at(0.5)).means[::3]])
     normalisation = Normalisation.fit(film.cameras, film.points)
     views = [normalisation.apply_camera(camera) for camera in film.cameras]
-    assert flow_points(100, normalisation.apply(points).float(), film, views) is None
+    assert flow_cloud(100, normalisation.apply(points).float(), film, views) is None
 
 
 def test_a_film_of_what_stands_still_needs_none():
     still = filmed([(walking_camera(time), time) for time in TIMES], None)
     normalisation = Normalisation.fit(still.cameras, still.points)
     views = [normalisation.apply_camera(camera) for camera in still.cameras]
-    assert flow_points(100, normalisation.apply(still.points).float(), still, views) is None
+    assert flow_cloud(100, normalisation.apply(still.points).float(), still, views) is None
 
 
 def test_half_of_the_control_points_begin_on_the_mover(film):

@@ -15,14 +15,14 @@ from helpers.tiny import tiny_config
 from scgs_warp.data.dataset import Dataset
 from scgs_warp.geometry.normalisation import Normalisation
 from scgs_warp.geometry.stereo import StereoPair
-from scgs_warp.training import stereo_clouds as module
+from scgs_warp.training import movers_by_stereo as module
 from scgs_warp.training import stereo_depth
 from scgs_warp.training.flow import Flows
+from scgs_warp.training.movers_by_stereo import moving_points, stereo_clouds
 from scgs_warp.training.points_on_movers import points_on_movers
 from scgs_warp.training.standing_cameras import levels
 from scgs_warp.training.start_motion import start_cloud
 from scgs_warp.training.state import TrainState
-from scgs_warp.training.stereo_clouds import moving_points, stereo_clouds
 from scgs_warp.types import Camera
 
 

@@ -15,12 +15,12 @@ from scgs_warp.data.dataset import Dataset
 from scgs_warp.gaussians import SH_C0
 from scgs_warp.geometry.normalisation import Normalisation
 from scgs_warp.rendering.render import render
-from scgs_warp.training import depth_clouds as depth_module
+from scgs_warp.training import movers_by_depth as depth_module
 from scgs_warp.training import points_on_movers as module
 from scgs_warp.training.clouds import Cloud
 from scgs_warp.training.depth import Depths
-from scgs_warp.training.depth_clouds import GHOST, depth_clouds, on_movers
 from scgs_warp.training.flow import Flows
+from scgs_warp.training.movers_by_depth import GHOST, depth_clouds, on_movers
 from scgs_warp.training.points_on_movers import points_on_movers
 from scgs_warp.training.state import TrainState
 
@@ -180,7 +180,7 @@ def test_a_few_useless_maps_do_not_replace_flow(film, monkeypatch):
     normalisation = Normalisation.fit(data.cameras, data.points)
     known = normalisation.apply(data.points).float()
     asked = []
-    monkeypatch.setattr(module, "flow_points", lambda *given: asked.append(given))
+    monkeypatch.setattr(module, "flow_cloud", lambda *given: asked.append(given))
     found = points_on_movers(300, 10_000, known, data, normalisation, 0)
     assert len(asked) == 1 and found.motion is None and bool(found.keep.all())
 

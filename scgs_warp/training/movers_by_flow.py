@@ -52,7 +52,7 @@ AROUND = 3
 """Number of sparse points nearest to a pixel; their median depth is used as that of the pixel's surroundings."""
 
 
-def flow_points(count: int, known: Tensor, data: Dataset, views: list[Camera]) -> Cloud | None:
+def flow_cloud(count: int, known: Tensor, data: Dataset, views: list[Camera]) -> Cloud | None:
     """Find up to ``count`` points of the frame in which flow tells most depths.
 
     Args:
