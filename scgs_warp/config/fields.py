@@ -97,7 +97,8 @@ class MotionConfig:
     neighbouring surfaces do. Off with ``scale_residual``, because skinning blends three values beside the motion."""
     turns: bool = newer(True, before=False)
     """Find the turns of round bodies, which outlines do not show, by comparing what the views show on their surface,
-    and add them to the motion before the second opacity reset (not in the paper). Only for cut-out subjects."""
+    and add them to the motion before each opacity reset from the second on (not in the paper). Only for cut-out
+    subjects."""
     mask: bool = False
     """Learn for each Gaussian which share of the motion it takes (an option of the official code); hyper-coordinates
     work better."""

@@ -1,4 +1,5 @@
-"""Initial points on what moves: by stereo if the cameras stand still, by optical flow if the frames are of a film."""
+"""Initial points on what moves: by stereo if the cameras stand still; in a film by its depth maps, if these show what
+moves, or by optical flow."""
 
 from __future__ import annotations
 
@@ -22,7 +23,8 @@ from .stereo_depth import StereoDepths, stereo_depths
 from .tracks import gather
 
 SHARE = 0.5
-"""Largest share of all initial points that stereo gives, and least share of the sparse points that must stay."""
+"""Largest share of all initial points that stereo or depth maps give, and least share of the sparse points that must
+stay."""
 
 
 class Movers(NamedTuple):
@@ -31,8 +33,8 @@ class Movers(NamedTuple):
     seen: Cloud
     """Points of one instant; none if nothing moves or no depth is found."""
     keep: Tensor
-    """[P] bool, True for sparse points to keep. Of standing cameras, those on what moves are replaced, because they may
-    show any instant."""
+    """[P] bool, True for sparse points to keep. Where stereo or depth maps show what moves, those on it are replaced,
+    because they may show any instant."""
     motion: SeenMotion | None = None
     """What stereo or depth maps show of the motion."""
     stereo: StereoDepths | None = None
@@ -48,7 +50,7 @@ def points_on_movers(
         most: largest number of points.
         count: number of all initial points. Flow gives only as many as the sparse points leave.
         known: [P, 3] sparse points of the data, normalised.
-        seed: seed of the choice among points of stereo.
+        seed: seed of the choice among the points that stereo or depth maps give.
     """
     views = [normalisation.apply_camera(camera) for camera in data.cameras]
     keep, found, motion = torch.ones(len(known), dtype=torch.bool), None, None
