@@ -13,7 +13,10 @@ from ..storage.files import open_regular
 from .images import INSPECTED
 from .readers.transforms import IMAGE_SUFFIXES
 
-FILMS = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".mts", ".m2ts", ".3gp", ".wmv")
+FILMS = (
+    *(".mp4", ".mov", ".m4v", ".qt", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".vob", ".mod", ".tod"),
+    *(".ts", ".m2t", ".mts", ".m2ts", ".mxf", ".dv", ".3gp", ".3g2", ".wmv", ".asf", ".flv", ".ogv"),
+)
 VIDEOS = (*FILMS, ".gif")
 ARCHIVES = (".zip", ".tar", ".gz", ".tgz", ".bz2", ".xz", ".7z", ".rar", ".zst")
 SPLATS = (".ply", ".splat", ".spz", ".sog", ".ksplat")

@@ -59,11 +59,12 @@ def test_the_journal_keeps_it():
 
 
 def test_films_of_camcorders_and_old_phones_are_films(tmp_path):
-    for name in ("00001.MTS", "b.3gp", "c.mp4", "d.txt"):
+    names = {"00001.MTS", "b.3gp", "c.mp4", "d.MXF", "e.ts", "f.dv", "MOV001.MOD"}
+    for name in (*names, "d.txt"):
         (tmp_path / name).write_bytes(b"x")
-    assert {file.name for file in videos_of(tmp_path)} == {"00001.MTS", "b.3gp", "c.mp4"}
-    (tmp_path / "b.3gp").unlink()
-    (tmp_path / "c.mp4").unlink()
+    assert {file.name for file in videos_of(tmp_path)} == names
+    for name in names - {"00001.MTS"}:
+        (tmp_path / name).unlink()
     with pytest.raises(UserError, match="holds 1 videos"):
         videos_of(tmp_path)
     for name in ("cam1", "cam10", "cam2"):
