@@ -91,7 +91,7 @@ class Video:
         self.incomplete: Incomplete | None = None
         with self._opened() as container:
             stream = main_pictures(container)
-            rate = float(stream.average_rate or 30)
+            rate = rate_of(stream)
             seconds = float(container.duration or 0) / 1e6
             self.count = int(stream.frames) or max(1, round(seconds * rate))
             self.rate = rate
@@ -165,6 +165,12 @@ def _no_video(path: Path, error: Exception) -> str:
 def main_pictures(container: Any) -> Any:
     """Return the stream of pictures that players show, which a cover or a preview may precede."""
     return container.streams.best("video") or container.streams.video[0]
+
+
+def rate_of(stream: Any) -> float:
+    """Return the frames per second of a video stream; 30 if it is unknown. Raw DV states the rate of its clock."""
+    ticks = stream.average_rate is not None and stream.average_rate * stream.time_base == 1
+    return float((ticks and stream.guessed_rate) or stream.average_rate or 30)
 
 
 class _Read:

@@ -34,6 +34,14 @@ def test_a_video_keeps_its_moments(tmp_path):
 
 
 @pytest.mark.skipif(os.name == "nt", reason="Windows allows no colon in a file's name")
+def test_raw_dv_has_the_rate_of_its_frames(tmp_path):
+    """Its header gives the rate of the clock, 60,000 a second, and progress counted to 72,000 for 30 frames."""
+    encoded(tmp_path / "film.dv", 30, codec="dvvideo", size=(720, 576))
+    film = Video(tmp_path / "film.dv")
+    assert film.rate == 25.0 and film.count == 30 == len(list(film.frames(64)))
+    assert len(recorded(film.path).seconds) == 30
+
+
 def test_the_name_of_a_film_may_hold_a_colon(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     with film("take:2.mp4", 10) as writer:

@@ -75,26 +75,34 @@ def without_beginning(path: Path, to: Path, count: int) -> None:
 
 
 def encoded(
-    path: Path, count: int, options: dict[str, str] | None = None, sound: float = 0.0, gop: int | None = None
+    path: Path,
+    count: int,
+    options: dict[str, str] | None = None,
+    sound: float = 0.0,
+    gop: int | None = None,
+    codec: str = "libx264",
+    size: tuple[int, int] = (160, 120),
 ) -> None:
-    """Write a film of H.264 with reordered frames, 25 a second, of a noisy pan over the wall.
+    """Write a film of H.264 with reordered frames, or of another codec, 25 a second, of a noisy pan over the wall.
 
     Args:
         options: of the container.
         sound: length of a silent sound track, seconds; 0 for none.
         gop: number of frames from one key frame to the next; None: as the encoder chooses.
+        size: width and height, to which the frames are enlarged.
     """
     import av
 
     rng = np.random.default_rng(0)
     with av.open(str(path), "w", options=options or {}) as out:
         keys = {} if gop is None else {"g": str(gop), "keyint_min": str(gop), "sc_threshold": "0"}
-        stream = out.add_stream("libx264", rate=25, options=keys)
-        stream.width, stream.height, stream.pix_fmt = 160, 120, "yuv420p"
+        stream = out.add_stream(codec, rate=25, options=keys)
+        (stream.width, stream.height), stream.pix_fmt = size, "yuv420p"
         track = out.add_stream("aac", rate=48000) if sound else None
         for picture in pan(range(0, 2 * count, 2)):
             noisy = (picture + rng.integers(-9, 9, picture.shape)).clip(0, 255).astype(np.uint8)
-            out.mux(stream.encode(av.VideoFrame.from_ndarray(noisy, format="rgb24")))
+            large = cv2.resize(noisy, size, interpolation=cv2.INTER_CUBIC)
+            out.mux(stream.encode(av.VideoFrame.from_ndarray(large, format="rgb24")))
         out.mux(stream.encode())
         if track is not None:
             for index in range(int(sound * 48000 / 1024)):

@@ -13,7 +13,7 @@ import numpy as np
 from ...errors import UserError
 from ...storage.files import for_ffmpeg
 from ..completeness import Incomplete, header_of, incomplete, lost_in_gaps
-from ..source import main_pictures
+from ..source import main_pictures, rate_of
 
 SAME_MOMENT = 0.08
 """Difference from an instant, as a share of the time between two frames, that is attributed to the error of the
@@ -79,7 +79,7 @@ def recorded(path: Path) -> Recorded:
             if not container.streams.video:
                 raise UserError(f"{path}: holds no pictures; take it out of the folder")
             stream = main_pictures(container)
-            rate = float(stream.average_rate or 30)
+            rate = rate_of(stream)
             header, hidden, packets = header_of(container, stream), 0, []
             for packet in container.demux(stream):
                 if packet.size and packet.is_discard:
