@@ -47,6 +47,33 @@ def find_bars(brightest: np.ndarray) -> Bars:
     return Bars(top, bottom, left, right)
 
 
+def are_possible(picture: np.ndarray) -> bool:
+    """Return whether the film of a picture [H, W, 3] may have bars: lines at two opposite sides are black."""
+    shown = picture.max(2) > BLACK
+    return any(max(lines[0].mean(), lines[-1].mean()) <= EMPTY for lines in (shown, shown.T))
+
+
+def common_bars(brightest: Sequence[np.ndarray]) -> list[Bars]:
+    """Find the bars of several films as :func:`find_bars` does. All films of one size that are black there have the
+    same: the width of each alone is uncertain by a few pixels, and unknown beside a dark wall."""
+    bars = [find_bars(each) for each in brightest]
+    for shape in {each.shape for each in brightest}:
+        alike = [number for number, each in enumerate(brightest) if each.shape == shape]
+        widest = Bars(*(max(widths) for widths in zip(*(bars[number] for number in alike))))
+        for number in alike:
+            near = all(0 <= most - own <= 2 * EDGE for most, own in zip(widest, bars[number]))
+            if near or _is_black(brightest[number], widest):
+                bars[number] = widest
+    return bars
+
+
+def _is_black(brightest: np.ndarray, bars: Bars) -> bool:
+    """Return whether nothing is shown in these bars, apart from their blurred edges."""
+    beside = np.ones(brightest.shape, bool)
+    Bars(*(max(width - EDGE - 1, 0) for width in bars)).cut(beside)[:] = False
+    return float((brightest[beside] > BLACK).mean()) <= EMPTY if beside.any() else True
+
+
 def _pair(brightest: np.ndarray) -> tuple[int, int]:
     """Return the widths of the bars above and below; zeros without them."""
     shares = (brightest > BLACK).mean(1)

@@ -176,7 +176,9 @@ class _Rig:
 
         def make() -> dict[str, Any]:
             folder.mkdir(exist_ok=True)
-            size = CommonSize(request.size, [0] * len(own), None) if known else common_size(self.videos, request.size)
+            size = CommonSize(request.size, [0] * len(own), None)
+            if not known:
+                size = common_size(self.videos, line.frames, request.size, self.show)
             with self.show(line.frames.size, "writing frames") as bar:
                 for camera, video in enumerate(self.videos):
                     self._unpack(video, camera, line, size, bar)
@@ -196,14 +198,14 @@ class _Rig:
             wanted.setdefault(index, []).append(instant)
         left, own = len(line.seconds), self.recorded[camera]
         tolerated = 0.5 * float(np.median(np.diff(own.seconds)))
-        for frame in video.frames(size.longest, wanted):
+        for frame in video.frames(size.whole(camera), wanted):
             if own.timed and abs(frame.seconds - own.seconds[frame.index]) > tolerated:
                 raise UserError(
                     f"{video.path}: frames before second {frame.seconds:.2f} cannot be decoded; copy it again from "
                     "where it was recorded, or leave out this part of all videos (--start, --end)"
                 )
             for instant in wanted[frame.index]:
-                write_png(self.picture_file(camera, instant), np.rot90(frame.image, size.turns[camera]))
+                write_png(self.picture_file(camera, instant), size.shown(camera, frame.image))
                 left -= 1
                 bar.advance()
             if left == 0:
