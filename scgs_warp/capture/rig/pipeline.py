@@ -5,11 +5,13 @@ from __future__ import annotations
 import hashlib
 import math
 import shutil
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
+from ...data.dataset import spread
 from ...errors import UserError
 from ...runtime.progress import ShowProgress, progress
 from ...storage.json_files import as_number
@@ -86,7 +88,7 @@ def _capture(rig: _Rig, known: KnownCameras | None) -> RigResult:
             write_neural_video(folder, request.folder, names, len(line.seconds), rig.picture_file, found, show)
         lines = [rig.describe(line), f"cameras of {request.folder.name}/poses_bounds.npy", *rig.cut_off()]
         return RigResult(names, starts, names, names[0], lines, before)
-    solved = rig.cameras(len(line.seconds))
+    solved = rig.cameras(line)
     missing = [name for number, name in enumerate(names) if number not in solved.cameras]
     rig.enough(solved, missing)
     held_out = request.held_out or names[min(solved.cameras)]
@@ -225,25 +227,27 @@ class _Rig:
         height, width = self.picture(camera, 0).shape[:2]
         return width, height
 
-    def _stills(self, count: int) -> FrameFiles:
-        """Make one picture per camera in which nothing moves, and its mask, of ``count`` instants."""
+    def _stills(self, line: TimeLine) -> FrameFiles:
+        """Make one picture per camera in which nothing moves, and its mask."""
         folder, masks = self.work / "stills", self.work / "still_masks"
+        some = np.array(spread(len(line.seconds), still.MOST_MOMENTS))
 
         def make() -> dict[str, Any]:
             folder.mkdir(exist_ok=True)
             masks.mkdir(exist_ok=True)
-            shares, shifts = [], []
+            shares, shifts, bumps = [], [], []
             with self.show(len(self.files), "finding what stands still") as bar:
                 for camera, name in enumerate(self.names):
-                    some = np.unique(np.linspace(0, count - 1, min(count, still.MOST_MOMENTS)).round().astype(int))
                     made = still.still_of([self.picture(camera, int(instant)) for instant in some])
                     write_png(folder / f"{name}.png", made.image)
                     mask = np.where(made.moves, 0, 255).astype(np.uint8)
                     write_png(masks / f"{name}.png", np.repeat(mask[..., None], 3, 2))
                     shares.append(float(made.moves.mean()))
                     shifts.append(made.shift)
+                    seconds = (self.request.start or 0.0) + line.moments[camera][some]
+                    bumps.append(made.bump and seconds[list(made.bump)].tolist())
                     bar.advance()
-            return {"moves": shares, "shifts": shifts}
+            return {"moves": shares, "shifts": shifts, "bumps": bumps}
 
         def clear() -> None:
             shutil.rmtree(folder, ignore_errors=True)
@@ -252,9 +256,9 @@ class _Rig:
         self.journal.stage("stills", None, make, clear)
         return FrameFiles(folder, [f"{name}.png" for name in self.names], masks)
 
-    def cameras(self, instants: int) -> cameras.RigSolution:
-        """Find the cameras with COLMAP, from pictures of ``instants`` moments."""
-        request, stills = self.request, self._stills(instants)
+    def cameras(self, line: TimeLine) -> cameras.RigSolution:
+        """Find the cameras with COLMAP."""
+        request, stills = self.request, self._stills(line)
         database, model, target = (self.work / name for name in ("database.db", "model", "adjusted"))
         count, chosen = len(self.names), cameras.pairs_of(len(self.names))
         sizes = {self.size_of(camera) for camera in range(count)}
@@ -360,6 +364,29 @@ class _Rig:
     def unsteady(self) -> list[str]:
         """Name the cameras that do not stand still."""
         stored = self.journal.result("stills")
-        shifts = stored.get("shifts", []) if isinstance(stored, dict) else []
-        moved = [n for n, shift in zip(self.names, shifts) if (as_number(shift) or 0.0) > still.MAX_SHIFT]
-        return [f"note: {', '.join(moved)} moved while recording; each camera of a rig gets one pose"] if moved else []
+        shifts, bumps = (stored.get(key, []) if isinstance(stored, dict) else [] for key in ("shifts", "bumps"))
+        lines = []
+        for name, shift, bump in zip_longest(self.names, shifts, bumps):
+            if (as_number(shift) or 0.0) > still.MAX_SHIFT:
+                lines.append(f"note: {name} {_moved(bump)}")
+        return lines
+
+
+def _moved(bump: Any) -> str:
+    """Say that a camera moved, and what to do.
+
+    Args:
+        bump: seconds before and after which it stood still; anything else if it moved for longer, or that is unknown.
+    """
+    seconds = [as_number(second) for second in bump] if isinstance(bump, list) else []
+    before, after = seconds if len(seconds) == 2 else (None, None)
+    if before is None or after is None:
+        return (
+            "moved while recording, but each camera of a rig gets one pose; give --start and --end of a part in which "
+            "it stands still, with another --output, or take its video out"
+        )
+    end, start = math.floor(100 * before) / 100, math.ceil(100 * after) / 100
+    return (
+        f"was moved between seconds {end:g} and {start:g}, but each camera of a rig gets one pose; --end {end:g} or "
+        f"--start {start:g}, with another --output, takes one part"
+    )

@@ -27,6 +27,9 @@ SHIFT_SIDE = 640
 MAX_SHIFT = 1.0
 """Motion of the camera between the first and the last moment, in pixels at ``SHIFT_SIDE``, above which it is moving."""
 
+LEAST_CORNERS = 12
+"""Least number of corners by which this motion is measured."""
+
 
 class Still(NamedTuple):
     """What a camera sees when nothing moves."""
@@ -37,6 +40,8 @@ class Still(NamedTuple):
     """[H, W] bool, True where the median may show a mover."""
     shift: float
     """Motion of the camera itself, in pixels at ``SHIFT_SIDE``."""
+    bump: tuple[int, int] | None = None
+    """Numbers of the pictures before and after which the camera stands still, if it moved between them only."""
 
 
 def still_of(pictures: Sequence[np.ndarray]) -> Still:
@@ -53,7 +58,8 @@ def still_of(pictures: Sequence[np.ndarray]) -> Still:
     reach = max(1, round(DILATION * max(gray.shape)))
     disc = cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (2 * reach + 1, 2 * reach + 1))
     moves = cv2.dilate(cv2.medianBlur(moves, 5), disc).astype(bool)
-    return Still(median, moves, _shift(stack[0], stack[-1], moves))
+    shift = _shift(stack[0], stack[-1], moves)
+    return Still(median, moves, shift, _bump(stack, moves, shift) if shift > MAX_SHIFT else None)
 
 
 def _scaled(picture: np.ndarray, factor: float) -> np.ndarray:
@@ -62,12 +68,29 @@ def _scaled(picture: np.ndarray, factor: float) -> np.ndarray:
     return (picture.astype(np.float32) * factor).clip(0, 255).astype(np.uint8)
 
 
+def _bump(stack: np.ndarray, moves: np.ndarray, shift: float) -> tuple[int, int] | None:
+    """Return the numbers of the pictures between which nearly all of the camera's motion lies; None if it goes on for
+    longer."""
+    before, after = 0, len(stack) - 1
+    while after - before > 1:
+        middle = (before + after) // 2
+        if _shift(stack[0], stack[middle], moves) > 0.5 * shift:
+            after = middle
+        else:
+            before = middle
+    rest = _shift(stack[0], stack[before], moves) + _shift(stack[after], stack[-1], moves)
+    return (before, after) if rest <= MAX_SHIFT else None
+
+
 def _shift(first: np.ndarray, last: np.ndarray, moves: np.ndarray) -> float:
-    """Return the median motion of the static pixels between two pictures."""
+    """Return the median motion of the static pixels between two pictures; of all pixels, if hardly any is static: those
+    of a camera that moves far differ from the median."""
     one, two = (cv2.cvtColor(shrunk(picture, SHIFT_SIDE), cv2.COLOR_RGB2GRAY) for picture in (first, last))
     hidden = cv2.resize(moves.astype(np.uint8), one.shape[::-1], interpolation=cv2.INTER_NEAREST).astype(bool)
     corners = cv2.goodFeaturesToTrack(one, 400, 0.01, 6, mask=np.where(hidden, 0, 255).astype(np.uint8))
-    if corners is None or len(corners) < 12:
+    if corners is None or len(corners) < LEAST_CORNERS:
+        corners = cv2.goodFeaturesToTrack(one, 400, 0.01, 6)
+    if corners is None or len(corners) < LEAST_CORNERS:
         return 0.0
     moved, found, _ = cv2.calcOpticalFlowPyrLK(one, two, corners, None)  # type: ignore[call-overload]
     kept = found.ravel() == 1

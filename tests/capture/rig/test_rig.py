@@ -8,6 +8,7 @@ import shutil
 from contextlib import contextmanager
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -137,6 +138,18 @@ def test_cameras_that_are_not_adjusted_are_named(films, captured, tmp_path):
     journal["stages"]["adjustment"]["result"] = False
     (other / "work/journal.json").write_text(json.dumps(journal))
     assert any(line.startswith("note: ") and "adjust" in line for line in run(films.folder, other).lines)
+
+
+def test_cameras_that_moved_are_named_with_a_remedy():
+    stored = {"shifts": [0.2, 5.0, 7.0], "bumps": [None, [1.239, 1.301], None]}
+    rig: Any = SimpleNamespace(names=["a", "b", "c"], journal=SimpleNamespace(result=lambda _: stored))
+    bumped, moved = pipeline._Rig.unsteady(rig)
+    assert (
+        bumped.startswith("note: b was moved between seconds 1.23 and 1.31,") and "--end 1.23 or --start 1.31" in bumped
+    )
+    assert moved.startswith("note: c moved while recording") and "take its video out" in moved
+    del stored["bumps"]  # as in captures of earlier versions
+    assert pipeline._Rig.unsteady(rig)[1] == moved
 
 
 def test_what_is_held_out_of_few_cameras_is_said(films, captured, monkeypatch):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from helpers.films import pan
 from scgs_warp.capture.rig.still import still_of
 
 COUNT = 10
@@ -25,3 +26,21 @@ def test_exposures_may_change():
     still = still_of(pictures)
     assert np.abs(still.image.astype(int) - scene).max() <= 4
     assert not still.moves.any()
+
+
+@pytest.mark.parametrize(
+    ("places", "shift", "bump"),
+    [
+        ([0] * 10, 0.0, None),
+        ([0] * 6 + [4] * 4, 4.0, (5, 6)),
+        ([0] * 5 + [24] * 5, 24.0, (4, 5)),  # All that is not uniform is masked.
+        ([0] * 9 + [3], 3.0, (8, 9)),
+        (range(10), 9.0, None),
+        ([0] * 3 + [5] * 3 + [10] * 4, 10.0, None),
+    ],
+)
+def test_a_camera_that_was_moved(places, shift, bump):
+    """The motion of a camera that was moved far was 0, because what it sees was masked."""
+    still = still_of(pan(places, 120, 320))
+    assert still.shift == pytest.approx(shift, abs=0.3)
+    assert still.bump == bump
