@@ -83,8 +83,9 @@ def _bump(stack: np.ndarray, moves: np.ndarray, shift: float) -> tuple[int, int]
 
 
 def _shift(first: np.ndarray, last: np.ndarray, moves: np.ndarray) -> float:
-    """Return the median motion of the static pixels between two pictures; of all pixels, if hardly any is static: those
-    of a camera that moves far differ from the median."""
+    """Return the motion of the camera between two pictures: that which most corners share, of pixels that are static,
+    or of all pixels if hardly any is static, because those of a camera that moves far differ from the median. In a dark
+    picture, movers count as static."""
     one, two = (cv2.cvtColor(shrunk(picture, SHIFT_SIDE), cv2.COLOR_RGB2GRAY) for picture in (first, last))
     hidden = cv2.resize(moves.astype(np.uint8), one.shape[::-1], interpolation=cv2.INTER_NEAREST).astype(bool)
     corners = cv2.goodFeaturesToTrack(one, 400, 0.01, 6, mask=np.where(hidden, 0, 255).astype(np.uint8))
@@ -93,5 +94,9 @@ def _shift(first: np.ndarray, last: np.ndarray, moves: np.ndarray) -> float:
     if corners is None or len(corners) < LEAST_CORNERS:
         return 0.0
     moved, found, _ = cv2.calcOpticalFlowPyrLK(one, two, corners, None)  # type: ignore[call-overload]
-    kept = found.ravel() == 1
-    return float(np.median(np.linalg.norm((moved - corners).reshape(-1, 2)[kept], axis=1))) if kept.any() else 0.0
+    before, after = (places.reshape(-1, 2)[found.ravel() == 1] for places in (corners, moved))
+    if len(before) < LEAST_CORNERS:
+        return 0.0
+    _, shared = cv2.estimateAffinePartial2D(before, after, ransacReprojThreshold=MAX_SHIFT)
+    kept = np.ones(len(before), bool) if shared is None else shared.ravel() == 1
+    return float(np.median(np.linalg.norm((after - before)[kept], axis=1))) if kept.any() else 0.0

@@ -44,3 +44,14 @@ def test_a_camera_that_was_moved(places, shift, bump):
     still = still_of(pan(places, 120, 320))
     assert still.shift == pytest.approx(shift, abs=0.3)
     assert still.bump == bump
+
+
+def test_movers_of_a_dark_film_do_not_move_the_camera():
+    """They differ too little from the median to be masked, and have most of the corners."""
+    first = (pan([0], 120, 320)[0] * 0.15).astype(np.uint8)
+    pictures = [first.copy() for _ in range(6)]
+    for index, picture in enumerate(pictures):
+        for row, step in enumerate((3, -2, 2, -3)):
+            picture[30 * row : 30 * row + 30, :200] = np.roll(first[30 * row : 30 * row + 30, :200], step * index, 1)
+    still = still_of(pictures)
+    assert still.moves.mean() < 0.5 and still.shift < 0.1 and still.bump is None
