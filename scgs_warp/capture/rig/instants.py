@@ -3,10 +3,12 @@ them."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
+from itertools import islice, pairwise
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -26,6 +28,9 @@ RIG_INSTANTS = 150
 SAME_RATE = 0.98
 """Ratio of the times between frames, of two cameras, above which these have one rate, as 30 and 29.97 frames a
 second."""
+
+HALF_A_FRAME = 0.75
+"""Share of the time between two frames below which stored pictures are the fields of one."""
 
 
 @dataclass(frozen=True)
@@ -66,7 +71,7 @@ class Recorded(NamedTuple):
 
 
 def recorded(path: Path) -> Recorded:
-    """Read the moments of a video's frames; at most the first picture is decoded.
+    """Read the moments of a video's frames; only the first pictures are decoded, unless fields are stored one by one.
 
     Raises:
         UserError: the file is no video.
@@ -94,8 +99,9 @@ def recorded(path: Path) -> Recorded:
         packets.pop()
     stamps = [packet.stamp for packet in packets]
     if stamps and not packets[0].key:  # nothing is shown before the first key frame
-        begin = _first_stamp(path)
+        begin = next((frame.pts for frame in _shown(path)), None)
         stamps = [stamp for stamp in stamps if begin is None or stamp is None or stamp >= begin]
+    stamps = _of_frames(path, stamps)
     known = sorted(stamp for stamp in stamps if stamp is not None)
     if not stamps or not 0.0 < rate < MAX_RATE:
         raise UserError(f"{path}: holds no frame that can be timed; save it as .mp4, or take it out")
@@ -111,19 +117,29 @@ def recorded(path: Path) -> Recorded:
     return Recorded(seconds, True, there)
 
 
-def _first_stamp(path: Path) -> int | None:
-    """Return the time stamp of the first frame that a video shows; None if it has none."""
+def _shown(path: Path) -> Iterator[Any]:
+    """Yield the frames that a video shows, as far as they can be decoded."""
     import av
     from av.error import FFmpegError
 
     with av.open(for_ffmpeg(path)) as container:
-        for packet in container.demux(main_pictures(container)):
-            try:
-                for frame in packet.decode():
-                    return frame.pts
-            except FFmpegError:  # later packets may be intact
-                continue
-    return None
+        stream = main_pictures(container)
+        stream.thread_type = "SLICE"  # as the frames are decoded later
+        for packet in container.demux(stream):
+            with suppress(FFmpegError):  # later packets may be intact
+                yield from packet.decode()
+
+
+def _of_frames(path: Path, stamps: Sequence[int | None]) -> list[int | None]:
+    """Return the time stamps of the frames, given those of the stored pictures. These are the same, unless a film is
+    interlaced and some of its fields are stored one by one, as many camcorders do: only decoding then tells which."""
+    known = sorted(stamp for stamp in stamps if stamp is not None)
+    first = [frame for frame in islice(_shown(path), 3) if frame.pts is not None]
+    interval = min((after.pts - before.pts for before, after in pairwise(first)), default=0)
+    even = all(after - before > HALF_A_FRAME * interval for before, after in pairwise(known))
+    if not any(frame.interlaced_frame for frame in first) or (even and len(known) == len(stamps)):
+        return list(stamps)
+    return [frame.pts for frame in _shown(path)]
 
 
 def _filled(stamps: Sequence[int | None], step: int) -> list[int]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from helpers.field_films import write_fields
 from helpers.films import cut_film, encoded, pan, without_beginning
 from scgs_warp.capture.rig.instants import recorded, time_line
 from scgs_warp.capture.source import Video
@@ -94,3 +95,16 @@ def test_moments_are_those_of_the_frames_of_a_film(tmp_path):
     (tmp_path / "text.mp4").write_text("no film")
     with pytest.raises(UserError, match="not a video"):
         recorded(tmp_path / "text.mp4")
+
+
+@pytest.mark.parametrize(("kind", "all_timed"), [("mts", True), ("mts", False), ("mp4", True), ("mp4", False)])
+def test_fields_that_are_stored_one_by_one_are_no_frames(tmp_path, kind, all_timed):
+    """Films of camcorders had twice as many frames as can be decoded, and were refused as damaged."""
+    rng = np.random.default_rng(0)
+    path = tmp_path / f"film.{kind}"
+    write_fields(path, rng.integers(40, 200, (20, 64, 96), np.uint8), all_timed)
+    made = recorded(path)
+    np.testing.assert_allclose(made.seconds, np.arange(20) / 25, atol=1e-6)
+    assert made.timed and made.incomplete is None
+    shown = list(Video(path).frames(96))
+    np.testing.assert_allclose([frame.seconds for frame in shown], made.seconds, atol=1e-6)
