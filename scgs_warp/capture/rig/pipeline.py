@@ -24,6 +24,7 @@ from ..source import Video, read_rgb
 from ..writing import FILE
 from . import adjustment, cameras, own_lenses, still, synchronisation
 from .common_size import CommonSize, common_size, common_size_of
+from .exposure import describe_exposures
 from .instants import Recorded, TimeLine, recorded, time_line
 from .neural_video import POSES, KnownCameras, known_cameras, write_neural_video
 from .points import points_at
@@ -97,7 +98,7 @@ def _capture(rig: _Rig, known: KnownCameras | None) -> RigResult:
     lines = [rig.describe(line), rig.describe_clock(starts)]
     lines += [f"note: {', '.join(missing)}: too little in common with the others; left out"] if missing else []
     lines += own_lenses.describe_lenses(solved) if request.lens == "auto" else []
-    lines += [*rig.size.describe(names), *rig.cut_off(), *rig.unadjusted(), *rig.unsteady()]
+    lines += [*rig.size.describe(names), *rig.cut_off(), *rig.unadjusted(), *rig.unsteady(), *rig.exposures]
     if not before:
         extra = rig.points(solved.cameras)
         write_rig(folder, solved, extra, names, line, held_out, rig.picture, show, rig.size.turns)
@@ -123,6 +124,8 @@ class _Rig:
         self.work = self.journal.work
         self.recorded: list[Recorded] = []
         self.size = CommonSize(request.size, [0] * len(files), None)
+        self.exposures: list[str] = []
+        """Note on cameras that are darker or brighter than most."""
 
     def _digest(self, earlier: bool) -> str:
         return hashlib.sha256("".join(video.digest(earlier) for video in self.videos).encode()).hexdigest()
@@ -304,6 +307,7 @@ class _Rig:
         self._draw(stills, set(solved.cameras) if solved else set())
         if solved is None:
             raise UserError(self._nothing_found(database, stills))
+        self.exposures = describe_exposures(model, stills, self.names)
         return solved
 
     def _nothing_found(self, database: Path, stills: FrameFiles) -> str:
