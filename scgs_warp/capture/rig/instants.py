@@ -29,6 +29,8 @@ SAME_RATE = 0.98
 """Ratio of the times between frames, of two cameras, above which these have one rate, as 30 and 29.97 frames a
 second."""
 
+FAR_LONGER = 1.25
+"""Ratio of the times in common, without and with a camera, above which this camera is worth a note."""
 HALF_A_FRAME = 0.75
 """Share of the time between two frames below which stored pictures are the fields of one."""
 
@@ -199,6 +201,24 @@ def time_line(
     taken = np.stack([own[index] for own, index in zip(moments, frames)])
     taken = np.where(np.abs(taken - chosen) <= SAME_MOMENT * interval, chosen, taken)
     return TimeLine(chosen - chosen[0], frames, taken - chosen[0])
+
+
+def shortened_by(names: Sequence[str], starts: Sequence[float], own: Sequence[np.ndarray]) -> list[str]:
+    """Name the camera without which the others have far more time in common: it was stopped early, or begun late.
+
+    Args:
+        names, starts, own: as for :func:`time_line`.
+    """
+    first, last = (np.array([start + seconds[end] for start, seconds in zip(starts, own)]) for end in (0, -1))
+    common = float(last.min() - first.max())
+    without = [float(np.delete(last, k).min() - np.delete(first, k).max()) for k in range(len(names))]
+    worst = int(np.argmax(without))
+    if len(names) < 3 or without[worst] < FAR_LONGER * common:
+        return []
+    return [
+        f"note: {names[worst]} limits the time in common to {common:.2f} s; without its video, it is "
+        f"{without[worst]:.2f} s"
+    ]
 
 
 def _nearest(moments: np.ndarray, wanted: np.ndarray) -> np.ndarray:

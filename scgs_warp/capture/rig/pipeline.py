@@ -25,7 +25,7 @@ from ..writing import FILE
 from . import adjustment, cameras, own_lenses, still, synchronisation
 from .common_size import CommonSize, common_size, common_size_of
 from .exposure import describe_exposures
-from .instants import Recorded, TimeLine, recorded, time_line
+from .instants import Recorded, TimeLine, recorded, shortened_by, time_line
 from .neural_video import POSES, KnownCameras, known_cameras, write_neural_video
 from .points import points_at
 from .request import FEWEST_CAMERAS, RigRequest, check, videos_of
@@ -96,6 +96,7 @@ def _capture(rig: _Rig, known: KnownCameras | None) -> RigResult:
     if held_out in missing:
         raise UserError(f"--held-out {held_out}: its pose was not found; hold out another camera")
     lines = [rig.describe(line), rig.describe_clock(starts)]
+    lines += shortened_by(names, starts, [each.seconds for each in rig.recorded]) if request.end is None else []
     lines += [f"note: {', '.join(missing)}: too little in common with the others; left out"] if missing else []
     lines += own_lenses.describe_lenses(solved) if request.lens == "auto" else []
     lines += [*rig.size.describe(names), *rig.cut_off(), *rig.unadjusted(), *rig.unsteady(), *rig.exposures]

@@ -7,7 +7,7 @@ import pytest
 
 from helpers.field_films import write_fields
 from helpers.films import cut_film, encoded, pan, without_beginning
-from scgs_warp.capture.rig.instants import recorded, time_line
+from scgs_warp.capture.rig.instants import recorded, shortened_by, time_line
 from scgs_warp.capture.source import Video
 from scgs_warp.data.synthetic.films.encoding import write_film
 from scgs_warp.errors import UserError
@@ -87,6 +87,17 @@ def test_no_time_in_common_is_said():
         time_line(NAMES[:2], [0.0, 5.0], [own, own], None)
     with pytest.raises(UserError, match="3 frames in common"):
         time_line(NAMES[:2], [0.0, 0.9], [own, own], None)
+
+
+def test_a_camera_that_was_stopped_early_is_named():
+    """Most of a film was lost without a word."""
+    long, short = np.arange(300) / 30, np.arange(60) / 30
+    (line,) = shortened_by(NAMES, [0.0, 0.5, 0.1], [long, short, long])
+    assert line == "note: b limits the time in common to 1.97 s; without its video, it is 9.87 s"
+    (line,) = shortened_by(NAMES, [0.0, 0.5, 6.0], [long, long, long])
+    assert line.startswith("note: c limits")
+    assert shortened_by(NAMES, [0.0, 0.5, 1.0], [long, long, long]) == []
+    assert shortened_by(NAMES[:2], [0.0, 0.5], [long, short]) == [], "two cameras are needed"
 
 
 def test_moments_are_those_of_the_frames_of_a_film(tmp_path):
