@@ -27,9 +27,9 @@ class Options:
     """Instead of VIDEO, folder with one video per camera of a rig: cameras that stand still. They are synchronised by
     their sound. Beside a poses_bounds.npy (Neural 3D Video), the videos are unpacked and the cameras kept."""
     poses: Path | None = None
-    """Instead of VIDEO, what another program has found: an .npz of MegaSaM, VGGT, Depth Anything 3 or Pi3, or a
-    folder of MonST3R, ViPE, CUT3R, DA3-Streaming, Polycam, Record3D, 3D Scanner App or Stray Scanner. Its cameras and
-    depth maps are taken as they are."""
+    """Instead of VIDEO, what another program has found: an .npz of MegaSaM, VGGT, MapAnything, Depth Anything 3,
+    SpatialTrackerV2 or Pi3, or a folder of MonST3R, ViPE, CUT3R, DA3-Streaming, Polycam, Record3D, 3D Scanner App or
+    Stray Scanner. Its cameras and depth maps are taken as they are."""
     offsets: tuple[float, ...] | None = None
     """Seconds at which the videos of a rig begin, in the order of their names, or 0 if all begin at once; by default
     found by sound."""

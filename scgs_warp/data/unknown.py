@@ -92,8 +92,9 @@ def not_a_folder(path: Path) -> UserError:
         )
     if suffix == ".npz":
         return UserError(
-            f"{path}: is no folder; if it holds the cameras of MegaSaM, VGGT, Depth Anything 3 or Pi3: scgs-warp "
-            f"capture --poses {shell_words(path)} --output {shell_words(f'data/{path.stem}')}"
+            f"{path}: is no folder; if it holds the cameras of MegaSaM, VGGT, MapAnything, Depth Anything 3, "
+            f"SpatialTrackerV2 or Pi3: scgs-warp capture --poses {shell_words(path)} --output "
+            f"{shell_words(f'data/{path.stem}')}"
         )
     if suffix in PACKED:
         return UserError(

@@ -103,6 +103,46 @@ def write_depth_anything(folder: Path, images: str = "image", depth: str = "dept
     return folder / "results.npz"
 
 
+def world_points(made: Wall) -> np.ndarray:
+    """[V, H, W, 3] what the pixels show, in the world."""
+    x, y = np.meshgrid(np.arange(WIDTH) + 0.5, np.arange(HEIGHT) + 0.5)
+    local = np.stack([x, y, np.ones_like(x)], -1) @ np.linalg.inv(K).T * made.depths[..., None]
+    return np.stack([(one - pose[:3, 3]) @ pose[:3, :3] for one, pose in zip(local, made.viewmats)])
+
+
+def write_map_anything(folder: Path) -> Path:
+    """VGGT's names for poses from camera to world."""
+    made = wall()
+    folder.mkdir(parents=True, exist_ok=True)
+    np.savez(
+        folder / "predictions.npz",
+        extrinsic=np.linalg.inv(made.viewmats).astype(np.float32),
+        intrinsic=np.tile(np.float32(K), (COUNT, 1, 1)),
+        world_points=world_points(made).astype(np.float32),
+        conf=1 + np.random.default_rng(0).random(made.depths.shape, np.float32),
+        depth=made.depths.astype(np.float32)[..., None],
+        images=made.images.astype(np.float32) / 255,
+        final_mask=np.ones(made.depths.shape, bool),
+    )
+    return folder / "predictions.npz"
+
+
+def write_spatial_tracker(folder: Path) -> Path:
+    made = wall()
+    folder.mkdir(parents=True, exist_ok=True)
+    np.savez(
+        folder / "result.npz",
+        coords=np.zeros((COUNT, 20, 3), np.float32),
+        extrinsics=made.viewmats.astype(np.float32),
+        intrinsics=np.tile(np.float32(K), (COUNT, 1, 1)),
+        depths=made.depths.astype(np.float32),
+        video=np.moveaxis(made.images, 3, 1).astype(np.float32) / 255,
+        visibs=np.ones((COUNT, 20, 1), np.float32),
+        unc_metric=0.5 + 0.5 * np.random.default_rng(0).random(made.depths.shape, np.float32),
+    )
+    return folder / "result.npz"
+
+
 def write_pi3(folder: Path) -> Path:
     """With points of the world in place of depth and intrinsics, and the first columns unsure."""
     made = wall()
@@ -273,6 +313,8 @@ def write_vipe(folder: Path, name: str = "film", camera: str = "PINHOLE", unpose
 WRITERS = {
     "MegaSaM": write_megasam,
     "VGGT": write_vggt,
+    "MapAnything": write_map_anything,
+    "SpatialTrackerV2": write_spatial_tracker,
     "Depth Anything 3": write_depth_anything,
     "Pi3": write_pi3,
     "MonST3R": write_monst3r,

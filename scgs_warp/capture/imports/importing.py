@@ -74,10 +74,10 @@ def read_scene(path: Path) -> ImportedScene:
     if (path / FILE).is_file():
         raise UserError(f"--poses {path}: is in nerfstudio's layout already; python apps/train.py --data {path}")
     raise UserError(
-        f"--poses {path}: is no scene of MegaSaM, VGGT, Depth Anything 3 or Pi3 (.npz), MonST3R "
-        f"({monst3r.TRAJECTORY}), ViPE (pose, rgb), CUT3R (camera, color), DA3-Streaming ({frame_folders.POSES}), "
-        "Uni4D (0000.npz), Polycam (keyframes), Record3D (.r3d; metadata.json, rgb), 3D Scanner App "
-        f"(frame_00000.json) or Stray Scanner ({stray_scanner.TRACK}); export one of these"
+        f"--poses {path}: is no scene of MegaSaM, VGGT, MapAnything, Depth Anything 3, SpatialTrackerV2 or Pi3 "
+        f"(.npz), MonST3R ({monst3r.TRAJECTORY}), ViPE (pose, rgb), CUT3R (camera, color), DA3-Streaming "
+        f"({frame_folders.POSES}), Uni4D (0000.npz), Polycam (keyframes), Record3D (.r3d; metadata.json, rgb), 3D "
+        f"Scanner App (frame_00000.json) or Stray Scanner ({stray_scanner.TRACK}); export one of these"
     )
 
 

@@ -8,7 +8,18 @@ import numpy as np
 import pytest
 import torch
 
-from helpers.foreign_scenes import COUNT, K, wall, write_cut3r, write_pi3, write_streaming, write_uni4d
+from helpers.foreign_scenes import (
+    COUNT,
+    K,
+    wall,
+    world_points,
+    write_cut3r,
+    write_megasam,
+    write_pi3,
+    write_streaming,
+    write_uni4d,
+    write_vggt,
+)
 from helpers.importing import entries, refused, silent
 from scgs_warp.capture import import_scene
 from scgs_warp.data import load
@@ -17,7 +28,7 @@ from scgs_warp.data import load
 def changed(path: Path, **arrays) -> Path:
     """Replace arrays of an .npz, or leave one out (None)."""
     with np.load(path) as old:
-        content = {name: old[name] for name in old.files} | arrays
+        content = {name: old[name] for name in old.files if name not in arrays} | arrays
     np.savez(path, **{name: value for name, value in content.items() if value is not None})
     return path
 
@@ -35,6 +46,26 @@ def test_points_of_pi3_that_noise_moves_give_the_focal_length(tmp_path):
         np.testing.assert_allclose(entry.camera.K.numpy(), K, rtol=0.01)
         depth = load(tmp_path / "data").depth(0)
         assert depth is not None and not depth[3].any() and not depth[:, :2].any(), "unknown, and unsure"
+
+
+def test_points_tell_the_direction_of_poses(tmp_path):
+    """Programs built on VGGT write its arrays with camera-to-world poses; points of another scale change nothing."""
+    truth = wall()
+    turns = truth.viewmats[1:, :3, :3] @ truth.viewmats[0, :3, :3].T
+    for name, inverse, scale in (("as VGGT", False, 1.0), ("inverse", True, 1.0), ("unlike the depth", False, 1.3)):
+        poses = np.linalg.inv(truth.viewmats) if inverse else truth.viewmats
+        points = {"world_points": np.float32(world_points(truth) * scale)}
+        source = changed(write_vggt(tmp_path / name / "source"), extrinsic=poses, pose_enc_list=None, **points)
+        import_scene(source, tmp_path / name / "data", silent)
+        views = torch.stack([entry.camera.viewmat for entry in entries(tmp_path / name / "data")]).double().numpy()
+        np.testing.assert_allclose(views[1:, :3, :3] @ views[0, :3, :3].T, turns, atol=1e-4, err_msg=name)
+
+
+def test_points_that_tell_no_direction(tmp_path):
+    """Unknown or misshapen points leave the direction to the program."""
+    for number, points in enumerate((np.full((COUNT, 36, 48, 3), np.nan), np.ones((COUNT, 5, 5, 3)))):
+        source = changed(write_megasam(tmp_path / f"source{number}"), world_points=points)
+        assert import_scene(source, tmp_path / f"data{number}", silent).program == "MegaSaM"
 
 
 def test_malformed_scenes_of_pi3(tmp_path):
