@@ -204,7 +204,7 @@ def _of_program(entries: list[Path]) -> str | None:
 
 def _exported_by(folder: Path) -> str | None:
     """Name the program whose export ``capture --poses`` reads; None for other folders."""
-    if (folder / "keyframes").is_dir():
+    if any(folder.glob("keyframes/*cameras")):
         return "Polycam"
     for base in (folder, folder / "EXR_RGBD"):
         if any((base / file).is_file() and (base / images).is_dir() for file, images in RECORD3D):

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from helpers.nerfstudio_files import write
+from scgs_warp.capture import import_scene
 from scgs_warp.data import load
 from scgs_warp.errors import UserError
 
@@ -139,6 +140,17 @@ def test_data_sets_that_are_not_read(tmp_path, files, expected):
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
         (tmp_path / name).write_bytes(b"")
     assert expected.format(path=tmp_path) in said(tmp_path)
+
+
+def test_keyframes_of_mast3r_slam(tmp_path):
+    """They lie in a folder of Polycam's name, but have no cameras there; the trajectory is a file beside it."""
+    (tmp_path / "keyframes/film").mkdir(parents=True)
+    (tmp_path / "film.txt").write_text("0.0 0 0 0 0 0 0 1\n")
+    for index in range(4):
+        (tmp_path / f"keyframes/film/{index}.5.png").write_bytes(b"")
+    assert f"scgs-warp capture {tmp_path}/keyframes/film" in said(tmp_path)
+    with pytest.raises(UserError, match="is no scene of"):
+        import_scene(tmp_path, tmp_path / "data")
 
 
 def test_cameras_in_no_known_layout(tmp_path):

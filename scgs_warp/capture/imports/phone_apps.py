@@ -50,7 +50,7 @@ Reader = Callable[[Path], ImportedScene]
 
 def is_polycam(path: Path) -> bool:
     """Return whether the folder is a raw capture of Polycam."""
-    return (path / "keyframes").is_dir()
+    return any(path.glob("keyframes/*cameras"))
 
 
 def read_polycam(path: Path) -> ImportedScene:
