@@ -175,6 +175,34 @@ class Skeleton:
             parts.append(other)
         return Skeleton((*parts, Part(new, tuple(chosen), name, joint)), "edited")
 
+    def attached(self, name: str, parent: str | None, positions: np.ndarray, edges: np.ndarray) -> Skeleton:
+        """Return the skeleton with a part hanging on another one, at a joint in the middle of their boundary.
+
+        Args:
+            parent: None: the part becomes a root.
+            positions: [M, 3] control points at time 0, world units.
+            edges: [E, 2] graph of the control points.
+
+        Raises:
+            UserError: a part does not exist, or the parent hangs on the part.
+        """
+        part = self.part(name)
+        if parent == part.parent:
+            return self
+        if parent is None:
+            joint = positions[list(part.nodes)].mean(0)
+        else:
+            above = self.part(parent)
+            if above.name == name:
+                raise UserError(f"part {name!r} cannot hang on itself; name another part, or none")
+            if above.name in self.branch(name):
+                raise UserError(
+                    f"part {name!r} cannot hang on {parent!r}, which hangs on it; attach {parent!r} elsewhere first"
+                )
+            joint = _middle_of_boundary(positions, edges, list(part.nodes), list(above.nodes))
+        moved = Part(name, part.nodes, parent, tuple(joint.tolist()))
+        return Skeleton(tuple(moved if other.name == name else other for other in self.parts), "edited")
+
     def with_joint(self, name: str, joint: Sequence[float], axis: Sequence[float] | None = None) -> Skeleton:
         """Return the skeleton with a part's joint moved.
 

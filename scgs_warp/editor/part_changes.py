@@ -1,4 +1,5 @@
-"""Changes of the parts themselves that pages ask for: other names, two parts as one, one part as two."""
+"""Changes of the parts themselves that pages ask for: other names, two parts as one, one part as two,
+another parent."""
 
 from __future__ import annotations
 
@@ -65,6 +66,14 @@ def split_part(editor: Host, fields: FieldReader) -> None:
     editor.parts.choose(made)
 
 
+def attach_part(editor: Host, fields: FieldReader) -> None:
+    """Make a part hang on another one, or without one on none, and choose it."""
+    name = short_text(fields, "name")
+    with editor.model.changing() as session:
+        session.attach_part(name, short_text(fields, "other") if "other" in fields else None)
+    editor.parts.choose(name)
+
+
 def _new_name(fields: FieldReader) -> str:
     """Return the name that a page gives, without spaces around it.
 
@@ -79,4 +88,6 @@ def _new_name(fields: FieldReader) -> str:
         raise UserError(f"{show_value(name)} is no name; give 1 to 100 letters") from None
 
 
-PART_CHANGES = {action.__name__: action for action in (rename_part, rename_handle, merge_parts, split_part)}
+PART_CHANGES = {
+    action.__name__: action for action in (rename_part, rename_handle, merge_parts, split_part, attach_part)
+}

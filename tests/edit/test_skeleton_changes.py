@@ -8,8 +8,9 @@ import numpy as np
 import pytest
 
 from helpers.edit_scenes import furthest
-from scgs_warp.edit.rotations import from_axis, rigid_fit
+from scgs_warp.edit.rotations import from_axis, rigid_fit, rotate
 from scgs_warp.edit.skeleton import Part, Skeleton, strongest
+from scgs_warp.errors import UserError
 
 ARM = ("shoulder_left", "elbow_left")
 
@@ -87,6 +88,48 @@ def test_a_merged_part_turns_as_the_upper_one_did(session, order):
     off = np.linalg.norm(session.node_positions(0.0) - before, axis=1)
     trunk = sorted(set(range(len(session))) - set(session.skeleton.part(order[0]).nodes))
     assert off[upper].mean() < 0.04 and off[trunk].max() < 0.02, (off[upper].mean(), off[trunk].max())
+
+
+def test_a_part_hangs_on_another_one_and_a_root_too(session):
+    """What hangs on a part comes with it, and the turn of the new parent carries both."""
+    session.attach_part("shoulder_left", None)
+    loose = session.skeleton.part("shoulder_left")
+    places = session.node_positions(0.0)
+    assert loose.parent is None and loose.degrees == 0.0
+    np.testing.assert_allclose(loose.joint, places[list(loose.nodes)].mean(0))
+    session.attach_part("shoulder_left", "head")
+    arm = session.skeleton.part("shoulder_left")
+    assert arm.parent == "head" and session.skeleton.part("elbow_left").parent == "shoulder_left"
+    near = [
+        np.linalg.norm(places[list(session.skeleton.part(n).nodes)] - arm.joint, axis=1) for n in (arm.name, "head")
+    ]
+    assert near[0].min() < np.median(near[0]) and abs(near[0].min() - near[1].min()) < 0.1
+    moved, joint, turn = furthest(session, "elbow_left"), session.joint_of("head", 0.0), from_axis((0, 0, 1), 40)
+    session.turn("head", 40, (0, 0, 1))
+    wanted = rotate(turn, places[moved] - joint) + joint
+    np.testing.assert_allclose(session.node_positions(0.0)[moved], wanted, atol=1e-6)
+    for _ in range(3):
+        assert session.undo()
+    assert session.skeleton.part("shoulder_left").parent == "torso"
+
+
+def test_a_root_is_attached_and_no_part_hangs_on_itself():
+    point = (0.0, 0.0, 0.0)
+    skeleton = Skeleton(
+        (Part("table", (0, 1), None, point), Part("ball", (2,), None, point), Part("pin", (3,), "ball", point))
+    )
+    places, edges = np.array([[0.0, 0, 0], [1, 0, 0], [3, 0, 0], [4, 0, 0]]), np.zeros((0, 2), int)
+    joined = skeleton.attached("ball", "table", places, edges)
+    assert joined.part("ball").parent == "table" and joined.part("ball").joint == (2.0, 0.0, 0.0)
+    assert joined.branch("table") == ("table", "ball", "pin") and joined.source == "edited"
+    assert joined.attached("ball", "table", places, edges) is joined
+    for parent, message in (
+        ("ball", "on itself"),
+        ("pin", "attach 'pin' elsewhere first"),
+        ("chair", "no part is called"),
+    ):
+        with pytest.raises(UserError, match=message):
+            skeleton.attached("ball", parent, places, edges)
 
 
 def test_a_side_branch_of_equal_size_ends_a_chain():

@@ -102,6 +102,19 @@ def test_parts_are_split_and_merged(editor, page):
     assert page.state["part"] == name and len(page.state["selection"]) == len(nodes) - 3, "it has its points again"
 
 
+def test_parts_are_attached_to_others(editor, page):
+    page.ask("select", what="nodes", nodes=list(editor.session.skeleton.parts[0].nodes[:3]), how="replace")
+    page.ask("split_part", to="tip")
+    first = names_of(page)[0]
+    assert "hang on itself" in page.ask("attach_part", name="tip", other="tip")["problem"]
+    page.ask("attach_part", name="tip")
+    assert parts_of(page)["list"][-1]["parent"] == -1 and page.state["part"] == "tip"
+    page.ask("attach_part", name="tip", other=first)
+    assert parts_of(page)["list"][-1]["parent"] == 0
+    page.ask("undo")
+    assert parts_of(page)["list"][-1]["parent"] == -1
+
+
 def test_a_handle_is_renamed_with_its_keys(editor, page):
     page.ask("select", what="nodes", nodes=[0, 1], how="replace")
     page.ask("put", degrees=[0, 0, 20], at=0.0)

@@ -27,6 +27,8 @@ function commandTable(studio) {
     ["rename", "Rename the chosen part or handle", "F2", () => studio.changes.rename(), () => link.state?.part || link.state?.active],
     ["merge", "Merge the chosen part with a neighbour", "", () => studio.changes.merge(),
       () => link.state?.part && studio.changes.neighbours(link.state.part).length],
+    ["attach", "Attach the chosen part to another one", "", () => studio.changes.attach(),
+      () => link.state?.part && studio.changes.supports(link.state.part).length],
     ["split", "Split the chosen control points off as a part", "", () => studio.changes.split(), () => chosen() && !link.state.part],
     ["hold", "Hold the selection as it is now", "h", () => ask("hold", { frame: studio.holdFrame }), chosen],
     ["frame", "Frame the scene", "f", () => studio.frame()],

@@ -155,6 +155,8 @@ function panelSections(studio) {
         { label: "Rename", when: (s) => s.part || s.active, press: () => studio.changes.rename() },
         { label: "Merge", title: "Make the part and a neighbour one", when: (s) => s.part && studio.changes.neighbours(s.part).length,
           press: () => studio.changes.merge() },
+        { label: "Attach", title: "Make the part hang on another one", when: (s) => s.part && studio.changes.supports(s.part).length,
+          press: () => studio.changes.attach() },
         { label: "Split", title: "Make the chosen control points of a part a part of their own", when: (s) => !s.part && chosen(s),
           press: () => studio.changes.split() }] },
       { type: "triple", label: "Move", when: (s) => active(s) || chosen(s), get: (s) => s.target.translation,

@@ -1,4 +1,4 @@
-// Changes of the parts themselves: another name, two parts as one, one part as two.
+// Changes of the parts themselves: another name, two parts as one, one part as two, another parent.
 
 const isolated = (name) => `\u2068${name}\u2069`; // a name may be written from right to left
 
@@ -32,6 +32,15 @@ class PartChanges {
       && (other === above || part.parent === row || (above >= 0 && part.parent === above))).map((part) => part.name);
   }
 
+  // Parts on which one can hang: all but itself, those that hang on it, and the present one. The empty name: none.
+  supports(name) {
+    const { parts } = this.studio.tools, row = parts.findIndex((part) => part.name === name), above = parts[row]?.parent;
+    const below = (other) => other >= 0 && (other === row || below(parts[other].parent));
+    if (row < 0) return [];
+    const others = parts.filter((part, other) => other !== above && !below(other)).map((part) => part.name);
+    return above >= 0 ? ["", ...others] : others;
+  }
+
   rename(name = this.state.part ?? this.state.active, part = Boolean(this.state.part)) {
     if (!name) return;
     const known = part ? null : this.state.handles.find((handle) => handle.name === name)?.part;
@@ -45,6 +54,13 @@ class PartChanges {
     if (!options.length) return;
     this.ask({ title: `Merge ${isolated(name)}`, label: "With", options, verb: "Merge",
       send: (other) => ["merge_parts", { name, other }] });
+  }
+
+  attach() {
+    const name = this.state.part, options = this.supports(name);
+    if (!options.length) return;
+    this.ask({ title: `Attach ${isolated(name)}`, label: "To", options, verb: "Attach",
+      send: (other) => ["attach_part", other ? { name, other } : { name }] });
   }
 
   split() {
@@ -66,7 +82,7 @@ class PartChanges {
     element("refused").textContent = "";
     name.hidden = Boolean(options);
     other.hidden = !options;
-    other.replaceChildren(...(options ?? []).map((one) => new Option(one, one)));
+    other.replaceChildren(...(options ?? []).map((one) => new Option(one || "nothing", one)));
     name.value = value ?? "";
     element("changes").showModal();
     (options ? other : name).focus();
