@@ -13,14 +13,18 @@ from scipy.sparse import coo_matrix, csr_matrix
 from scipy.sparse.csgraph import connected_components
 
 MIN_SHARED = 2
-"""Number of Gaussians that two neighbouring patches share at least."""
+"""Number of Gaussians that two neighbouring patches share at least; where a patch has fewer than ``FEW`` on average, a
+single one."""
+FEW = 5.0
 MIN_SHARE = 0.02
 """Skinning weight below which a Gaussian does not belong to its second patch."""
 MAX_GAP = 3.0
-"""Distance between neighbouring patches, relative to the median, beyond which they are not connected."""
+"""Largest distance between neighbouring patches at any time, relative to the median, beyond which they are not
+connected."""
 
 MIN_PIECE = 4
-"""Number of patches below which a piece that shares no Gaussian with the rest belongs to its surroundings."""
+"""Number of patches below which a piece that shares no Gaussian with the rest belongs to its surroundings, unless it
+holds the Gaussians of that many usual patches and goes away from them."""
 
 
 class Motions(NamedTuple):
@@ -172,26 +176,36 @@ def _edges(
         second[usable] = row[indices[usable, column]]
     pairs = np.stack([nearest, second], 1)[(second >= 0) & (second != nearest)]
     pairs, shared = np.unique(np.sort(pairs, axis=1), axis=0, return_counts=True)
-    pairs = pairs[shared >= MIN_SHARED]
+    pairs = pairs[shared >= (1 if len(nearest) < FEW * len(nodes) else MIN_SHARED)]
     centres = moments.posed / moments.count[:, None, None]
+    reach = np.inf
     if len(pairs):
-        gaps = np.sqrt(((centres[pairs[:, 0]] - centres[pairs[:, 1]]) ** 2).sum(2).mean(1))
-        pairs = pairs[gaps <= MAX_GAP * np.median(gaps)]
-    return np.concatenate([pairs, _bridges(centres, pairs)])
+        gaps = ((centres[pairs[:, 0]] - centres[pairs[:, 1]]) ** 2).sum(2)
+        reach = MAX_GAP * float(np.median(np.sqrt(gaps.mean(1))))
+        pairs = pairs[np.sqrt(gaps.max(1)) <= reach]
+    return np.concatenate([pairs, _bridges(centres, moments.count, pairs, reach)])
 
 
-def _bridges(centres: np.ndarray, pairs: np.ndarray) -> np.ndarray:
-    """Connect each piece of fewer than ``MIN_PIECE`` patches to the patch that stays nearest to it, [B, 2]."""
+def _bridges(centres: np.ndarray, counts: np.ndarray, pairs: np.ndarray, reach: float) -> np.ndarray:
+    """Connect each piece of fewer than ``MIN_PIECE`` patches to the patch that stays nearest to it, [B, 2]. A body of
+    its own is left alone: it holds many Gaussians and is out of ``reach`` at some time.
+
+    Args:
+        counts: [P] Gaussians of each patch.
+    """
     count = len(centres)
     graph = coo_matrix((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(count, count))
     piece = connected_components(graph, directed=False)[1]
     sizes = np.bincount(piece)
     if sizes.max() < MIN_PIECE:
         return np.zeros((0, 2), np.int64)
+    bodies = np.bincount(piece, counts) >= MIN_PIECE * counts.mean()
     large, found = np.flatnonzero(sizes[piece] >= MIN_PIECE), []
     for label in np.flatnonzero(sizes < MIN_PIECE):
         own = np.flatnonzero(piece == label)
-        away = ((centres[own][:, None] - centres[large][None]) ** 2).sum(3).mean(2)
-        here, there = np.unravel_index(away.argmin(), away.shape)
+        away = ((centres[own][:, None] - centres[large][None]) ** 2).sum(3)
+        here, there = np.unravel_index(away.mean(2).argmin(), away.shape[:2])
+        if bodies[label] and away[here, there].max() > reach**2:
+            continue
         found.append(sorted((int(own[here]), int(large[there]))))
     return np.array(found, np.int64).reshape(-1, 2)

@@ -9,6 +9,7 @@ import torch
 from helpers.edit_scenes import bar_scene, figure_scene
 from scgs_warp.edit import EditSession
 from scgs_warp.edit.necks import find_necks
+from scgs_warp.edit.parts import find_parts
 from scgs_warp.edit.patches import make_patches
 from scgs_warp.edit.skeleton_from_motion import find_skeleton, moves
 from scgs_warp.runtime import environment
@@ -92,6 +93,16 @@ def test_a_body_that_only_travels_does_not_move():
     tracks = np.stack([start + time * np.array([1.0, 2.0, 0.5]) for time in np.linspace(0, 1, 5)])
     assert not moves(make_patches(tracks, indices, weights))
     assert find_skeleton(scene, (indices, weights)).source == "motion"
+
+
+def test_bodies_that_travel_apart_move():
+    start = np.random.default_rng(0).random((400, 3)) + np.repeat([[0.0, 0.0, 0.0], [5.0, 0.0, 0.0]], 200, axis=0)
+    index = np.arange(400) // 20
+    around = np.stack([index, index // 10 * 10 + (index + 1) % 10], 1)
+    rise = np.outer(index >= 10, [0.0, 0.0, 1.0])
+    patches = make_patches(np.stack([start, start + rise]), around, np.tile([0.6, 0.4], (400, 1)))
+    assert moves(patches)
+    assert np.array_equal(find_parts(patches), (np.arange(20) >= 10).astype(int))
 
 
 def test_necks_do_not_depend_on_threads(all_threads):

@@ -10,6 +10,9 @@ import numpy as np
 import pytest
 import torch
 from scipy.optimize import linear_sum_assignment
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 
 from helpers.edit_scenes import bar_scene, figure_scene
 from helpers.jointed_rods import TIMES, chain, plain_width, same_partition
@@ -253,6 +256,36 @@ def test_pieces_are_parts_and_crumbs_belong_to_the_nearest():
     assert 10 in make_patches(tracks, both, np.tile([0.7, 0.3], (400, 1))).edges, "a crumb is connected"
 
 
+@pytest.mark.parametrize(("points", "own"), [(400, True), (10, False)])
+def test_a_ball_that_jumps_off_a_table_is_a_part_and_a_crumb_is_not(points, own):
+    """The ball has a single control point, and shares Gaussians with the table on which it lay."""
+    random = np.random.default_rng(0)
+    board = np.repeat(np.arange(10), 40)
+    table = np.stack([board + 0.5, np.zeros(400), np.zeros(400)], 1) + random.uniform(-0.5, 0.5, (400, 3))
+    ball = np.array([4.5, 0.0, 1.0]) + 0.3 * random.normal(size=(points, 3))
+    up = np.array([[0.0, 0.0, max(0.0, 4.0 * math.sin(math.pi * (time - 6) / 9))] for time in range(16)])
+    tracks = np.stack([np.concatenate([table, ball + height]) for height in up])
+    first = np.concatenate([board, np.full(points, 10)])
+    second = np.concatenate([np.minimum(board + 1, 9), np.where(np.arange(points) < 5, 4, 10)])
+    patches = make_patches(tracks, np.stack([first, second], 1), np.tile([0.7, 0.3], (len(first), 1)))
+    labels = find_parts(patches)
+    assert np.array_equal(labels, [0] * 10 + [int(own)])
+    assert [joint.parent for joint in find_joints(patches, labels)] == [-1] * (2 if own else 1)
+
+
+@pytest.mark.parametrize("each", [3, 20])
+def test_a_surface_holds_together_with_few_gaussians_for_each_control_point(each):
+    random = np.random.default_rng(0)
+    nodes, points = random.random((400, 2)), random.random((400 * each, 2))
+    away, near = cKDTree(nodes).query(points, 4)
+    weights = np.exp(-0.5 * (away / away.mean()) ** 2)
+    tracks = np.tile(np.column_stack([points, np.zeros(len(points))]), (2, 1, 1))
+    patches = make_patches(tracks, near, weights / weights.sum(1, keepdims=True))
+    count = len(patches.nodes)
+    graph = coo_matrix((np.ones(len(patches.edges)), patches.edges.T), shape=(count, count))
+    assert count > 330 and np.bincount(connected_components(graph)[1]).max() > 0.9 * count
+
+
 def measured_turn(first: list[float], second: list[float], axis: tuple[int, int, int]) -> float:
     """Degrees measured between two clouds of these extents, of which the second turns by 30 degrees."""
     random = np.random.default_rng(0)
@@ -331,7 +364,10 @@ def test_parts_do_not_depend_on_threads(all_threads):
     assert parts[0] == parts[1] and len(parts[0]) >= 2, "one half swings, the other rests"
 
 
-def test_a_few_patches_that_keep_changing_parts_come_to_an_end():
+def test_a_few_patches_that_keep_changing_parts_come_to_an_end(monkeypatch):
+    monkeypatch.setattr(
+        "scgs_warp.edit.patches.FEW", 0.0
+    )  # without edges of a single Gaussian, they change again and again
     assert EditSession(bar_scene(nodes=12, gaussians=20)).skeleton.names == ("part-1",)
 
 
