@@ -18,7 +18,8 @@ from .patches import Moments, Motions
 MOST_LOST = 1.5
 """Distance of a part's points from the common motion, at most, relative to that from its own motion."""
 MOST_OFF = 1.8
-"""The same distance, at most, relative to that of a typical patch from the motion of its part."""
+"""The same distance, at most, relative to that of a typical patch of a typical part from the motion of its part. If all
+patches counted alike, a large body that stands still would set the measure for those that move."""
 
 
 def find_shared(
@@ -44,7 +45,9 @@ def find_shared(
     """
     own = moments.errors_under(motions)[np.arange(len(labels)), labels]
     alone = _means(own, moments.count, labels)
-    least, found = MOST_OFF**2 * float(np.median(own / moments.count)), None
+    off = own / moments.count
+    usual = float(np.median([np.median(off[labels == part]) for part in np.unique(labels)]))
+    least, found = MOST_OFF**2 * usual, None
     for row, pair in enumerate(pairs):
         rows = np.flatnonzero(np.isin(labels, pair))
         both = moments.take(rows)

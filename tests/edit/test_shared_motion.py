@@ -56,6 +56,17 @@ def test_two_badly_known_parts_of_a_well_known_body_do_not_merge():
     assert find_shared(patches.moments, segment, motions, last, np.ones(1), fit_parts) is None
 
 
+def test_a_large_body_that_stands_still_does_not_keep_the_others_apart():
+    """The first segment holds most of the patches, and its motion is known exactly."""
+    patches, segment, _ = chain([60.0, 60.0, 20.0], noise=[0.0, 0.05, 0.05, 0.05])
+    rows = np.concatenate([np.flatnonzero(segment == 0)] * 5 + [np.flatnonzero(segment > 0)])
+    moments, labels, pair = patches.moments.take(rows), segment[rows], np.array([[2, 3]])
+    motions = fit_parts(moments, labels)[1]
+    own = moments.errors_under(motions)[np.arange(len(labels)), labels]
+    assert np.median(own) < 1e-3 * np.median(own[labels > 0]), "most patches stand still"
+    assert find_shared(moments, labels, motions, pair, np.ones(1), fit_parts) == 0
+
+
 @pytest.mark.parametrize(
     "degrees, noise, decides",
     [([50.0], [0.01, 0.01], "lost"), ([60.0, 60.0, 60.0, 40.0], [0.01, 0.01, 0.01, 0.2, 0.2], "off")],
@@ -69,7 +80,8 @@ def test_doubt_raises_both_limits_of_a_shared_motion(degrees, noise, decides):
     errors = both.errors_under(fit_parts(both, np.zeros(len(rows), np.int64))[1])[:, 0]
     mine = [segment[rows] == part for part in pair]
     lost = max(errors[each].sum() / own[rows][each].sum() for each in mine)
-    off = max(errors[each].sum() / both.count[each].sum() for each in mine) / np.median(own / patches.moments.count)
+    usual = np.median([np.median((own / patches.moments.count)[segment == part]) for part in range(len(degrees) + 1)])
+    off = max(errors[each].sum() / both.count[each].sum() for each in mine) / usual
     needed = {"lost": math.sqrt(lost) / MOST_LOST, "off": math.sqrt(off) / MOST_OFF}
     least = max(needed.values())
     assert needed[decides] == least > 1.2, "without doubt the parts stay apart"
