@@ -86,10 +86,10 @@ def write_gaussians(
         return write_compressed_ply(path, gaussians, antialiased=antialiased)
     if suffix == ".spz":
         return write_spz(path, gaussians, antialiased=antialiased, version=spz_version)
+    if suffix == ".splat":
+        return write_splat(path, gaussians)
     if suffix == ".ply":
         write_gaussian_ply(path, gaussians, antialiased=antialiased)
-    elif suffix == ".splat":
-        write_splat(path, gaussians)
     elif suffix in (".sog", META):
         write_sog(path, gaussians, antialiased=antialiased)
     else:

@@ -18,10 +18,13 @@ ROW = np.dtype([("mean", "<f4", 3), ("scale", "<f4", 3), ("color", "u1", 4), ("q
 quaternion wxyz as 128 + 128 q."""
 
 
-def write_splat(path: str | Path, gaussians: Gaussians) -> None:
+def write_splat(path: str | Path, gaussians: Gaussians) -> int:
     """Write activated Gaussians in descending order of volume times opacity, for viewers that draw while loading.
     Colours, opacities and rotations are rounded to 8 bits; harmonics above degree 0 are lost. Sharp Gaussians are
     approximated (``Gaussians.plain``).
+
+    Returns:
+        Number of values that were clipped: colours outside [0, 1], by more than rounding to 8 bits changes.
 
     Raises:
         UserError: the file cannot be written.
@@ -33,11 +36,13 @@ def write_splat(path: str | Path, gaussians: Gaussians) -> None:
     colors = 0.5 + SH_C0 * gaussians.sh_dc.detach().cpu().double().numpy()
     rows = np.zeros(len(scales), ROW)
     rows["mean"], rows["scale"] = gaussians.means.detach().cpu().numpy(), scales
-    rows["color"] = np.rint(255.0 * np.column_stack([colors, opacities]).clip(0.0, 1.0))
+    bytes_ = np.rint(255.0 * np.column_stack([colors, opacities]))
+    rows["color"] = bytes_.clip(0, 255)
     rows["quat"] = np.rint(128.0 + 128.0 * quats).clip(0, 255)
     importance = scales.prod(axis=1) * opacities
     order = np.argsort(-importance, kind="stable")
     write_atomically(Path(path), rows[order].tobytes())
+    return int(((bytes_ < 0) | (bytes_ > 255)).sum())
 
 
 def read_splat(path: str | Path) -> GaussianParameters:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
+import torch
 
 from helpers.export_files import cloud, difference, ordered, ply_columns
 from helpers.node_packages import splat_transform
@@ -29,3 +30,10 @@ def test_splat_is_read_by_splat_transform_and_by_us(tmp_path):
     # it takes a byte q for 2 q / 255 - 1, where the format's first reader has q / 128 - 1
     found = difference(ply_columns(splat_transform(tmp_path / "a.splat", tmp_path / "b.ply"), sort=True), limited)
     assert all(found[name] <= limit + 1e-6 for name, limit in {**limits, "degrees": 2.0}.items()), str(found)
+
+
+def test_what_is_clipped_is_counted(tmp_path):
+    truth = ordered(cloud(20, degree=0))
+    truth.sh_dc.clamp_(-0.5, 0.5)[3] = torch.tensor([-2.0, 0.0, 2.0])
+    truth.sh_dc[4] = 0.5 / SH_C0  # white
+    assert write_still(tmp_path / "a.splat", truth) == 2
