@@ -13,6 +13,7 @@ from ..geometry.axes import Axis
 from ..storage.output_folders import make_parent, refuse_inputs
 from ..storage.suffixes import longest_suffix
 from ..visualization.video import MAX_FRAMES, SLOWEST
+from ..visualization.video import SUFFIXES as FILM_SUFFIXES
 
 Format = Literal[
     "ply",
@@ -259,7 +260,12 @@ def check_output(path: Path, kind: Format, option: str = "--output") -> None:
     Raises:
         UserError: the suffix is wrong, a file or folder is in the way, or the folder cannot be written.
     """
-    ending, suffix = SUFFIXES[kind], output_suffix(path)
+    ending, suffix, name = SUFFIXES[kind], output_suffix(path), path.name.lower()
+    of_files = tuple(filter(None, (*SUFFIXES.values(), *OTHER_SUFFIXES, *FILM_SUFFIXES)))
+    if name in of_files and name != META:
+        raise UserError(f"{option} {path}: is a suffix without a name; put one before it")
+    if not ending and name.endswith(of_files):
+        raise UserError(f"{option} {path}: is named like a file; name a folder for the frames of --format {kind}")
     choices = {"tracks": TRACK_SUFFIXES, "mesh": MESH_SUFFIXES}.get(kind, (ending,))
     if ending and suffix not in choices:
         longer = f", not in {suffix}," if suffix.endswith(ending) else f" (not {META})" if path.name == META else ""
@@ -268,6 +274,6 @@ def check_output(path: Path, kind: Format, option: str = "--output") -> None:
         raise UserError(f"{option} {path}: is a folder; give another name")
     if not ending and path.exists() and not path.is_dir():
         raise UserError(f"{option} {path}: is a file; name a folder for --format {kind}")
-    if path.name.lower() == META:
+    if name == META:
         check_folder(path)
     make_parent(path)

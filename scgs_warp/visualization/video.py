@@ -44,10 +44,12 @@ def check_path(path: str | Path) -> Path:
     """Check before rendering that a film can be written to ``path``.
 
     Raises:
-        UserError: unknown suffix, a folder with other files, or a folder that cannot be written.
+        UserError: unknown suffix, a suffix without a name, a folder with other files, or a folder that cannot be written.
     """
     path = Path(path)
     suffix = path.suffix.lower()
+    if path.name.lower() in (".mp4", ".gif"):
+        raise UserError(f"{path}: is a suffix without a name; put one before it")
     if suffix not in SUFFIXES:
         raise UserError(f"{path}: cannot write {path.suffix} films; end the name in .mp4 or .gif, or name a folder")
     if suffix and path.is_dir():

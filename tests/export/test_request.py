@@ -64,6 +64,9 @@ def test_a_glb_is_still_where_an_instant_is_given():
         ("meta.json", {"format": "cameras"}, r"end the name in .json \(not meta.json\) for"),
         ("a.ply", {"spz_version": 3}, "--spz-version: --format ply has no such versions"),
         ("a.compressed.ply", {"format": "ply"}, "end the name in .ply, not in .compressed.ply"),
+        ("a.mp4", {"format": "ply-sequence"}, "a.mp4: is named like a file; name a folder for the frames"),
+        ("a.SOG", {"format": "sog-sequence"}, "a.SOG: is named like a file; name a folder for the frames"),
+        (".glb", {}, r"\.glb: is a suffix without a name; put one before it"),
     ],
 )
 def test_options_that_cannot_work_are_refused_in_one_line(tmp_path, name, fields, words):

@@ -161,6 +161,7 @@ def test_mistakes_are_told_in_one_line(tmp_path: Path) -> None:
         (tmp_path / "full", "other files"),
         (tmp_path / "file", "is a file"),
         (tmp_path / "dir.mp4", "is a folder"),
+        (tmp_path / ".mp4", "a suffix without a name"),
         (tmp_path / "file" / "film.mp4", "cannot be written"),
     ]:
         with pytest.raises(UserError, match=words) as caught:
