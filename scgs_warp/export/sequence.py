@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-import os
-import shutil
 from collections.abc import Callable, Iterable
 from pathlib import Path
 
 from ..errors import UserError
 from ..formats.gaussian_files import write_gaussians
-from ..storage.files import hidden_beside
-from ..storage.output_folders import check_replaceable, replace_folder
+from ..storage.files import new_beside
+from ..storage.output_folders import check_replaceable, make_parent, replace_folder
 from ..types import Gaussians
 
 NAME = "frame_{:05d}"
@@ -46,19 +44,17 @@ def write_sequence(
         UserError: as :func:`check_replaceable`, or the folder cannot be written.
     """
     path = check_folder(path)
-    temporary = hidden_beside(path, f"{os.getpid()}.part")
-    shutil.rmtree(temporary, ignore_errors=True)
+    make_parent(path)
     count = 0
     try:
-        for gaussians in frames:
-            write_gaussians(temporary / f"{NAME.format(count)}{ending}", gaussians, antialiased=antialiased)
-            count += 1
-            if advance is not None:
-                advance()
-        check_folder(path)
-        replace_folder(path, temporary)
+        with new_beside(path, folder=True) as temporary:
+            for gaussians in frames:
+                write_gaussians(temporary / f"{NAME.format(count)}{ending}", gaussians, antialiased=antialiased)
+                count += 1
+                if advance is not None:
+                    advance()
+            check_folder(path)
+            replace_folder(path, temporary)
     except OSError as error:
         raise UserError(f"{path}: cannot be written ({error.strerror}); give another folder") from None
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
     return count

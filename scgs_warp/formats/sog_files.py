@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import io
-import os
-import shutil
 import warnings
 import zipfile
 import zlib
@@ -13,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from ..errors import UserError
-from ..storage.files import hidden_beside, read_bytes, write_and_flush, write_atomically
+from ..storage.files import new_beside, read_bytes, write_and_flush, write_atomically
 from ..storage.output_folders import check_replaceable, make_parent, replace_folder
 from ..storage.safe_paths import inside
 
@@ -148,17 +146,13 @@ def write_files(path: Path, files: dict[str, bytes]) -> None:
         write_atomically(path, stream.getvalue())
         return
     folder = check_folder(path)
-    temporary = hidden_beside(folder, f"{os.getpid()}.part")
     try:
-        shutil.rmtree(temporary, ignore_errors=True)
-        temporary.mkdir()
-        for name, content in files.items():
-            write_and_flush(temporary / name, content)
-        replace_folder(folder, temporary)
+        with new_beside(folder, folder=True) as temporary:
+            for name, content in files.items():
+                write_and_flush(temporary / name, content)
+            replace_folder(folder, temporary)
     except OSError as error:
         raise UserError(f"{folder}: cannot be written ({error.strerror}); give another folder") from None
-    finally:
-        shutil.rmtree(temporary, ignore_errors=True)
 
 
 def check_folder(path: Path) -> Path:

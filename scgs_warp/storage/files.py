@@ -6,10 +6,12 @@ import errno
 import os
 import re
 import secrets
+import shutil
 import stat
-from contextlib import suppress
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import IO, BinaryIO
+from typing import BinaryIO
 
 from ..errors import UserError
 
@@ -137,55 +139,78 @@ def write_atomically(path: Path, content: bytes) -> None:
     """
     if not path.name:
         raise UserError(f"{path}: is no file name; give one")
-    temporary: Path | None = None
     try:
-        _remove_leftovers(path)
-        temporary, file = _open_temporary(path)
-        with file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-            if os.name == "posix":  # renamed while its lock is held; Windows cannot rename an open file
-                os.replace(temporary, path)
-        if os.name != "posix":
+        with new_beside(path) as temporary:
+            with open(temporary, "wb") as file:
+                file.write(content)
+                file.flush()
+                os.fsync(file.fileno())
             os.replace(temporary, path)
-    except BaseException as error:
-        if temporary is not None:
-            with suppress(OSError):
-                temporary.unlink(missing_ok=True)
-        if not isinstance(error, OSError):
-            raise
+    except OSError as error:
         raise UserError(
             f"{path}: cannot be written ({error.strerror}); make room or give another name, an earlier file is intact"
         ) from error
     sync_folder(path.parent)
 
 
-def _open_temporary(path: Path) -> tuple[Path, IO[bytes]]:
-    """Create a temporary file for ``path`` under a new name, and lock it to show that its writer is alive."""
+@contextmanager
+def new_beside(path: Path, folder: bool = False) -> Iterator[Path]:
+    """Yield a new, empty temporary file beside ``path``, or a folder, and remove at the end what has not been renamed.
+    What killed writers of ``path`` left there is removed first: a temporary file is locked as long as its writer lives.
+
+    Raises:
+        OSError: the file or folder cannot be made.
+    """
+    _remove_leftovers(path)
+    temporary, number = _make_temporary(path, folder)
+    try:
+        yield temporary
+    finally:
+        if number is not None:
+            os.close(number)
+        with suppress(OSError):
+            _remove(temporary)
+
+
+def _make_temporary(path: Path, folder: bool) -> tuple[Path, int | None]:
+    """Make a temporary file or folder for ``path`` under a new name. It is locked until the returned descriptor is
+    closed; None: this system has no locks."""
     while True:
         temporary = hidden_beside(path, f"{secrets.token_hex(4)}.tmp")
-        file = open(temporary, "xb")
-        try:
-            if fcntl is not None:
-                with suppress(OSError):  # a file system without locks
-                    fcntl.flock(file.fileno(), fcntl.LOCK_EX)
-            if os.fstat(file.fileno()).st_nlink or os.name != "posix":
-                return temporary, file
-        except BaseException:
-            file.close()
-            raise
-        file.close()  # Another process took it for a leftover before it was locked.
+        if folder:
+            temporary.mkdir()
+        else:
+            temporary.touch(exist_ok=False)
+        if fcntl is None:
+            return temporary, None
+        with suppress(FileNotFoundError):  # Another process took it for a leftover before it was locked.
+            number = os.open(temporary, os.O_RDONLY if folder else os.O_RDWR)
+            with suppress(OSError):  # a file system without locks
+                fcntl.flock(number, fcntl.LOCK_EX)
+            if temporary.exists():
+                return temporary, number
+            os.close(number)
 
 
 def _remove_leftovers(path: Path) -> None:
-    """Remove temporary files of ``path`` whose writers were killed; a file that is locked has a writer."""
+    """Remove temporary files and folders of ``path`` whose writers were killed; one that is locked has a writer."""
     if fcntl is None:
         return
     pattern = re.compile(re.escape(hidden_beside(path, "").name) + r"[0-9a-f]{8}\.tmp")
     with suppress(OSError):
         names = [entry.name for entry in os.scandir(path.parent) if pattern.fullmatch(entry.name)]
         for left in (path.with_name(name) for name in names):
-            with suppress(OSError), open_regular(left) as file:
-                fcntl.flock(file.fileno(), fcntl.LOCK_EX | fcntl.LOCK_NB)
-                left.unlink()
+            with suppress(OSError):
+                number = os.open(left, os.O_RDONLY | os.O_NONBLOCK | os.O_NOFOLLOW)
+                try:
+                    fcntl.flock(number, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                    _remove(left)
+                finally:
+                    os.close(number)
+
+
+def _remove(path: Path) -> None:
+    if path.is_dir():
+        shutil.rmtree(path)
+    else:
+        path.unlink(missing_ok=True)

@@ -6,13 +6,12 @@ import errno
 import os
 import re
 import shutil
-import tempfile
 from collections.abc import Callable, Iterable
 from contextlib import suppress
 from pathlib import Path
 
 from ..errors import UserError
-from .files import hidden_beside
+from .files import hidden_beside, new_beside
 
 OF_RUNS = (
     "config.json",
@@ -101,17 +100,11 @@ def write_folder_atomically(folder: Path, write: Callable[[Path], None]) -> None
         raise UserError(f"{folder}: is the current folder or contains it; name a new folder")
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
-        work = Path(tempfile.mkdtemp(prefix=f".{folder.name}-", dir=folder.parent))
-    except OSError as error:
-        raise UserError(f"{folder}: cannot be made ({error.strerror}); choose a folder that can be written") from None
-    try:
-        write(work)
-        os.chmod(work, 0o755)  # mkdtemp makes private folders.
-        replace_folder(folder, work)
+        with new_beside(folder, folder=True) as work:
+            write(work)
+            replace_folder(folder, work)
     except OSError as error:
         raise UserError(f"{folder}: cannot be written ({error.strerror}); make room or choose another folder") from None
-    finally:
-        shutil.rmtree(work, ignore_errors=True)
 
 
 def replace_folder(path: Path, new: Path) -> None:

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import itertools
 import os
-import shutil
 import struct
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from fractions import Fraction
 from pathlib import Path
 from typing import Any
@@ -15,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from ..errors import UserError
-from ..storage.files import for_ffmpeg, hidden_beside
+from ..storage.files import for_ffmpeg, new_beside
 from ..storage.output_folders import check_replaceable, make_parent, replace_folder
 from ..storage.png_files import write_png
 
@@ -44,7 +43,7 @@ def check_path(path: str | Path) -> Path:
     """Check before rendering that a film can be written to ``path``.
 
     Raises:
-        UserError: unknown suffix, a suffix without a name, a folder with other files, or a folder that cannot be written.
+        UserError: unknown suffix, a suffix without a name, a folder with other files, or one that cannot be written.
     """
     path = Path(path)
     suffix = path.suffix.lower()
@@ -106,12 +105,12 @@ def _disk_errors_as_user_errors(path: Path) -> Iterator[None]:
 class FilmWriter:
     """Writer that ``film`` yields; one subclass per format."""
 
-    def __init__(self, path: Path, fps: float, quality: int) -> None:
+    def __init__(self, path: Path, temporary: Path, fps: float, quality: int) -> None:
         self.path = path
+        self.temporary = temporary
         self.fps = fps
         self.quality = quality
         self.frames = 0
-        self.temporary = hidden_beside(path, f"{os.getpid()}.tmp")
         self._shape: tuple[int, ...] | None = None
 
     def write(self, frame: np.ndarray) -> None:
@@ -148,11 +147,7 @@ class FilmWriter:
         os.replace(self.temporary, self.path)
 
     def discard(self) -> None:
-        """Remove the temporary file; safe to call at any time."""
-        if self.temporary.is_dir():
-            shutil.rmtree(self.temporary, ignore_errors=True)
-        else:
-            self.temporary.unlink(missing_ok=True)
+        """Leave an incomplete film; safe to call at any time."""
 
 
 class _Mp4(FilmWriter):
@@ -203,14 +198,13 @@ class _Mp4(FilmWriter):
         if container is not None:
             with suppress(OSError):
                 container.close()
-        super().discard()
 
 
 class _Gif(FilmWriter):
     """GIF with one palette for the whole film, to avoid flicker; frames are kept in memory until it is chosen."""
 
-    def __init__(self, path: Path, fps: float, quality: int) -> None:
-        super().__init__(path, fps, quality)
+    def __init__(self, path: Path, temporary: Path, fps: float, quality: int) -> None:
+        super().__init__(path, temporary, fps, quality)
         self._kept: list[np.ndarray] = []
 
     def _write(self, frame: np.ndarray) -> None:
@@ -247,13 +241,6 @@ def gif_durations(frames: int, fps: float) -> list[int]:
 class _Folder(FilmWriter):
     """Folder of numbered PNGs; the frames of an earlier film are replaced as a whole."""
 
-    def __init__(self, path: Path, fps: float, quality: int) -> None:
-        super().__init__(check_frames(path), fps, quality)
-
-    def _open(self, frame: np.ndarray) -> None:
-        self.discard()
-        self.temporary.mkdir()
-
     def _write(self, frame: np.ndarray) -> None:
         write_png(self.temporary / FRAME_NAME.format(self.frames), frame)
 
@@ -288,13 +275,16 @@ def film(path: str | Path, fps: float = 30, *, quality: int = QUALITY) -> Iterat
             "or film.fps in an edit), or end the name in .mp4"
         )
     writers = {".mp4": _Mp4, ".gif": _Gif, "": _Folder}
-    writer = writers[path.suffix.lower()](path, fps, quality)
-    try:
+    kind = writers[path.suffix.lower()]
+    with ExitStack() as left:
+        with _disk_errors_as_user_errors(path):
+            path = check_frames(path) if kind is _Folder else path
+            temporary = left.enter_context(new_beside(path, folder=kind is _Folder))
+        writer = kind(path, temporary, fps, quality)
+        left.callback(writer.discard)
         yield writer
         if writer.frames == 0:
             raise UserError(f"{path}: a film needs at least one frame")
         with _disk_errors_as_user_errors(path):
             writer.close()
             writer.publish()
-    finally:
-        writer.discard()

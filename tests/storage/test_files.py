@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 import os
+import subprocess
+import sys
 import threading
 import tracemalloc
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from scgs_warp.errors import UserError
 from scgs_warp.storage import files
 from scgs_warp.storage.files import open_regular, read_bytes, read_text, write_atomically
+from scgs_warp.visualization.video import film
 
 pytestmark = pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="no pipes with names here")
 
@@ -119,6 +123,24 @@ def test_leftovers_of_killed_writers_are_removed(tmp_path: Path):
         write_atomically(tmp_path / "a.json", b"{}")
     left = {entry.name for entry in tmp_path.iterdir()}
     assert left == {"a.json", *names[1:]}
+
+
+@pytest.mark.parametrize("name", ["film.mp4", "film.gif", "frames"])
+def test_leftovers_of_killed_films_are_removed(name: str, tmp_path: Path):
+    pytest.importorskip("fcntl")
+    begin = (
+        "import os, signal, sys, numpy; from scgs_warp.visualization.video import film\n"
+        "with film(sys.argv[1]) as writer:\n"
+        "    writer.write(numpy.zeros((16, 16, 3), numpy.uint8)); os.kill(os.getpid(), signal.SIGKILL)"
+    )
+    subprocess.run([sys.executable, "-c", begin, str(tmp_path / name)], check=False)
+    (left,) = tmp_path.iterdir()
+    assert left.name.startswith(f".{name}.")
+    with film(tmp_path / name) as writer:
+        writer.write(np.zeros((16, 16, 3), np.uint8))
+        with film(tmp_path / name) as other:  # does not take the first one's file for a leftover
+            other.write(np.zeros((16, 16, 3), np.uint8))
+    assert [entry.name for entry in tmp_path.iterdir()] == [name]
 
 
 def test_the_longest_name_is_written(tmp_path: Path):
