@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import functools
+import math
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -18,8 +19,9 @@ from ..motion.control_points import ControlPoints
 from ..types import Pose
 from .page_scene import PageMotion, even_times, one_sided, poses_at, sample_poses, to_array
 
-MAX_SAMPLES = 601
-"""Largest number of moments. A longer film has fewer samples than frames; the page interpolates between them."""
+LEAST_STEPS, MAX_SAMPLES = 120, 601
+"""Least number of steps between moments: a page is smooth however few frames the film has. Largest number of moments: a
+longer film has fewer samples than frames; the page interpolates between them."""
 JUMP = 0.25
 """Difference in scene time between two moments from which on the film jumps, where nothing is interpolated."""
 
@@ -79,10 +81,10 @@ def own_motion(session: EditSession) -> PageMotion:
 
 
 def film_times(session: EditSession) -> list[float]:
-    """Return evenly spaced moments of the film in seconds, from its beginning to just before its end, where a film that
-    is played again jumps to the beginning."""
+    """Return evenly spaced moments of the film in seconds, among them its frames if these are not too many, from its
+    beginning to just before its end, where a film that is played again jumps to the beginning."""
     film = session.edit.film
-    count = min(MAX_SAMPLES, max(2, film.frames + 1))
+    count = min(MAX_SAMPLES, film.frames * math.ceil(LEAST_STEPS / film.frames) + 1)
     return np.linspace(0.0, film.seconds * (1.0 - 1e-9), count).tolist()
 
 

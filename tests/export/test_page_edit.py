@@ -47,7 +47,7 @@ def test_frames_of_an_edit_are_those_of_the_session(browser, options, tmp_path):
     write_page(session.scene, tmp_path / "page.html", motion=edited_motion(session))
     visit = Visit(browser, tmp_path / "page.html")
     assert visit.ask("player.seconds") == 2.0 and visit.ask("player.follows")
-    for at in (0.0, 0.5, 1.3, 1.9):
+    for at in (0.0, 0.5, 0.95, 1.3, 1.9):  # of which the third lies between two frames
         camera = film_camera(session, at, 120)
         background = session.edit.film.background
         assert background is not None
@@ -68,18 +68,29 @@ def test_frames_of_an_edit_are_those_of_the_session(browser, options, tmp_path):
     visit.context.close()
 
 
+@pytest.mark.parametrize(("seconds", "fps", "count"), [(2.0, 10.0, 121), (0.1, 10.0, 121), (4.0, 31.0, 125)])
+def test_a_page_has_moments_between_the_frames_of_a_short_film(seconds, fps, count):
+    session = EditSession(bar_scene())
+    film = dataclasses.replace(session.edit.film, seconds=seconds, fps=fps)
+    session.apply(dataclasses.replace(session.edit, film=film))
+    times = np.array(film_times(session))
+    assert len(times) == count
+    frames = np.arange(film.frames) / fps
+    assert np.abs(times[:, None] - frames).min(axis=0).max() < 1e-6, "those of the frames are among them"
+
+
 def test_what_jumps_is_not_interpolated(browser, tmp_path):
     session = bent_session()
     playback = dataclasses.replace(session.edit.playback, repeat="loop", speed=2.0)
     session.apply(dataclasses.replace(session.edit, playback=playback))
     motion = edited_motion(session)
     times = film_times(session)
-    assert motion.facts["jumps"] == [10] and times[10] == pytest.approx(1.0) and times[-1] < 2.0
+    assert motion.facts["jumps"] == [60] and times[60] == pytest.approx(1.0) and times[-1] < 2.0
     write_page(session.scene, tmp_path / "page.html", motion=motion)
     visit = Visit(browser, tmp_path / "page.html")
-    camera = film_camera(session, 1.05, 100)
-    ours = session.render(camera, session.scene_time(times[10]), times[10], (0, 0, 0)).rgb.clamp(0, 1).numpy()
-    assert psnr(visit.render(camera, 1.05 / 2.0), ours) > 40
+    camera = film_camera(session, 1.008, 100)
+    ours = session.render(camera, session.scene_time(times[60]), times[60], (0, 0, 0)).rgb.clamp(0, 1).numpy()
+    assert psnr(visit.render(camera, 1.008 / 2.0), ours) > 40
     visit.context.close()
 
 
