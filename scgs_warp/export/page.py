@@ -97,6 +97,8 @@ def write_page(scene: Scene, path: Path, options: PageOptions | None = None, **f
         raise UserError(f"{path}: end the name of a page in .html")
     if path.is_dir():
         raise UserError(f"{path}: is a folder; give the page another name")
+    if options.url and card_path(path).is_dir():
+        raise UserError(f"{card_path(path)}: is a folder, and the picture for links goes there; rename one of the two")
     if options.max_mib is not None and not options.max_mib > 0:
         raise UserError(f"--max-mib (max_mib) is {options.max_mib:g}; give a size in MiB above 0, or none")
     picture = options.picture or functools.partial(poster, scene)
@@ -105,9 +107,10 @@ def write_page(scene: Scene, path: Path, options: PageOptions | None = None, **f
         path.parent.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise UserError(f"{path.parent}: cannot be made ({error.strerror}); give another folder") from None
-    if options.url:
-        write_atomically(card_path(path), picture(CARD_SIZE))
+    card = picture(CARD_SIZE) if options.url else None
     write_atomically(path, page)
+    if card is not None:
+        write_atomically(card_path(path), card)
     return count
 
 

@@ -142,3 +142,21 @@ def test_a_link_to_a_published_page_has_a_picture(tmp_path):
     page.write_page(scene, tmp_path / "other.html")
     assert not any("og:image" in attrs.values() for _, attrs, _ in Parts(tmp_path / "other.html").found)
     assert not (tmp_path / "other.jpg").exists()
+
+
+def test_no_picture_is_written_for_a_page_that_fails(tmp_path, monkeypatch):
+    scene = bar_scene(nodes=8, gaussians=20)
+    (tmp_path / "a.jpg").mkdir()
+    with pytest.raises(UserError, match=r"a\.jpg: is a folder, and the picture for links goes there"):
+        page.write_page(scene, tmp_path / "a.html", url="https://example.org/a.html")
+    plain = page.write_atomically
+
+    def full(path: Path, content: bytes) -> None:
+        if path.suffix == ".html":
+            raise UserError(f"{path}: cannot be written")
+        plain(path, content)
+
+    monkeypatch.setattr(page, "write_atomically", full)
+    with pytest.raises(UserError, match="cannot be written"):
+        page.write_page(scene, tmp_path / "b.html", url="https://example.org/b.html")
+    assert [entry.name for entry in tmp_path.iterdir()] == ["a.jpg"]
