@@ -40,7 +40,7 @@ from .poster import edited_poster
 from .request import FRAME_FORMATS, SEQUENCES, ExportRequest, check_request
 from .sequence import ENDINGS, check_folder, write_sequence
 from .skeleton import Skeleton, build_skeleton
-from .still import FILE_UP, check_reach, clipping, write_still
+from .still import FILE_UP, check_reach, losses, write_still
 
 if TYPE_CHECKING:
     from .page import PageOptions
@@ -120,7 +120,7 @@ def _export_still(request: ExportRequest, device: str) -> str:
     gaussians = keep_finite(gaussians)
     version = request.spz_version or 4
     clipped = write_still(request.output, gaussians, up=up, antialiased=antialiased, spz_version=version)
-    return f"{len(gaussians.means):,} Gaussians {when}{clipping(request.output, clipped)}"
+    return f"{len(gaussians.means):,} Gaussians {when}{losses(request.output, gaussians, clipped)}"
 
 
 def _at_moment(request: ExportRequest, scene: Scene, session: EditSession | None) -> tuple[Gaussians, str]:

@@ -6,9 +6,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal
 
+import numpy as np
+
 from ..edit import EditSession
 from ..formats.gaussian_files import write_gaussians
-from ..formats.gaussian_spz import check_positions
+from ..formats.gaussian_spz import check_positions, coarse_step
 from ..geometry.axes import Axis, direction
 from ..types import Gaussians
 from .finite import keep_finite
@@ -28,7 +30,11 @@ def check_reach(path: Path, pose: Callable[[], Gaussians]) -> None:
         UserError: it cannot.
     """
     if output_suffix(path) == ".spz":
-        check_positions(path, keep_finite(pose()).means.detach().cpu().double().numpy())
+        check_positions(path, _positions(keep_finite(pose())))
+
+
+def _positions(gaussians: Gaussians) -> np.ndarray:
+    return gaussians.means.detach().cpu().double().numpy()
 
 
 def write_edited(
@@ -45,18 +51,23 @@ def write_edited(
         compute: as for ``plain_scene``; it is called once more than there, for a .spz twice.
 
     Returns:
-        Number of Gaussians, and a note on clipped values.
+        Number of Gaussians, and a note on what the format loses.
     """
     check_reach(path, lambda: compute(lambda: session.gaussians_at(time, at)))
     scene = plain_scene(session.scene, compute)
     gaussians = compute(lambda: keep_finite(session.drawn_with(scene).gaussians_at(time, at)))
     clipped = write_still(path, gaussians, up=scene.overview.up, antialiased=scene.config.antialiased)
-    return len(gaussians.means), clipping(path, clipped)
+    return len(gaussians.means), losses(path, gaussians, clipped)
 
 
-def clipping(path: Path, clipped: int) -> str:
-    """Return a note on clipped values; empty if there are none."""
-    return f" ({clipped:,} values clipped to what {output_suffix(path)} can hold)" if clipped else ""
+def losses(path: Path, gaussians: Gaussians, clipped: int) -> str:
+    """Return a note on clipped values and on positions that the format rounds visibly; empty if there are none."""
+    suffix = output_suffix(path)
+    notes = [f"{clipped:,} values clipped to what {suffix} can hold"] if clipped else []
+    step = coarse_step(_positions(gaussians)) if suffix == ".spz" else None
+    if step is not None:
+        notes.append(f"positions rounded to {step:.2g}, which shows in this scene; a .ply is exact")
+    return f" ({'; '.join(notes)})" if notes else ""
 
 
 def write_still(

@@ -34,6 +34,8 @@ SCALE_STEPS, SCALE_OFFSET = 16.0, 10.0
 6 %, from 4.5e-5 to 377."""
 POSITION_BITS = 16
 """Resolution of positions: they are rounded to (size of the scene) / ``2 ** POSITION_BITS``."""
+COARSE_BITS = 11
+"""Resolution below which rounding shows: half a pixel where the scene is 2,000 pixels wide."""
 MAX_FRACTION_BITS = 24
 READ_COUNT = 15
 """Number of coefficients that are read: those of degrees 1 to 3."""
@@ -48,14 +50,24 @@ def fraction_bits(means: np.ndarray) -> int:
     Raises:
         UserError: a position is beyond 2^23.
     """
-    middle = np.median(means, axis=0)
-    extent = float(np.quantile(np.abs(means - middle).max(axis=1), 0.95)) or 1.0
-    wanted = POSITION_BITS - math.floor(math.log2(extent))
+    wanted = POSITION_BITS - math.floor(math.log2(_reach(means)))
     reach = float(np.abs(means).max()) or 1.0
     room = math.floor(math.log2((2**23 - 1) / reach))
     if room < 0:
         raise UserError(f"a Gaussian lies {reach:.3g} from the origin, and .spz holds up to 8.3e6; write a .ply")
     return max(0, min(wanted, room, MAX_FRACTION_BITS))
+
+
+def _reach(means: np.ndarray) -> float:
+    """Return the distance from their middle within which 95 % of positions [N, 3] lie along each axis."""
+    return float(np.quantile(np.abs(means - np.median(means, axis=0)).max(axis=1), 0.95)) or 1.0
+
+
+def coarse_step(means: np.ndarray) -> float | None:
+    """Return the step to which positions [N, 3] are rounded, if so few steps span the scene that pictures show it: a
+    scene that is very small or far from the origin, or that has Gaussians far from the others. Otherwise None."""
+    step = 2.0 ** -fraction_bits(means)
+    return step if _reach(means) < step * 2**COARSE_BITS else None
 
 
 def check_positions(path: str | Path, means: np.ndarray) -> int:

@@ -19,7 +19,7 @@ from scgs_warp.edit.rotations import multiply
 from scgs_warp.errors import UserError
 from scgs_warp.export.request import ExportRequest
 from scgs_warp.export.run import export
-from scgs_warp.export.still import write_still
+from scgs_warp.export.still import losses, write_still
 from scgs_warp.formats import gaussian_files, gaussian_spz
 from scgs_warp.formats.gaussian_files import read_antialiased, read_gaussians
 from scgs_warp.formats.gaussian_spz import FLIPS, fraction_bits, pack_quats, unpack_quats
@@ -109,6 +109,19 @@ def test_spz_says_how_much_it_clips(tmp_path):
     truth.sh_rest[4, 2] = torch.tensor([1.5, -1.5, 1.0])
     truth.scales[6, 1] = 1e-6
     assert write_still(tmp_path / "a.spz", truth) == 3
+
+
+def test_positions_that_are_rounded_visibly_are_told(tmp_path):
+    path = tmp_path / "a.spz"
+    for shift, scale, words in (
+        (0.0, 1.0, ""),
+        (1e5, 1.0, "positions rounded to 0.016,"),
+        (0.0, 1e-5, "rounded to 6e-08"),
+    ):
+        truth = replace(cloud(), means=cloud().means.detach() * scale + shift)
+        note = losses(path, truth, write_still(path, truth))
+        assert (words in note) if words else "rounded" not in note, note
+    assert "rounded" not in losses(tmp_path / "a.ply", truth, 0)
 
 
 def test_spz_packs_every_rotation(tmp_path):
