@@ -15,7 +15,7 @@ from ..runtime import memory
 from ..runtime.progress import progress
 from ..scene.scene import Scene
 from .finite import finite_rows
-from .fourdgs import KEYFRAME_EVERY, StillPart, View, write_fourdgs
+from .fourdgs import COEFFICIENT, KEYFRAME_EVERY, StillPart, View, write_fourdgs
 from .moments import AnimationMoment, posed_gaussians
 from .segments import Course
 from .skeleton import extent_of
@@ -79,9 +79,18 @@ def export_fourdgs(
         means, quats, scales, colors = (np.stack([frame[k][rows] for frame in frames]) for k in range(4))
         course = Course(seconds, means, quats, scales, colors, extent_of(means[0]))
         still = StillPart(opacities[rows], [values[rows] for values in harmonics])
+        clipped = count_clipped(course, still)
         up, view = scene.overview.up, default_view(scene.overview)
         count = write_fourdgs(path, course, still, up=up, view=view, advance=shown.advance)
-    return f"{int(rows.sum()):,} Gaussians in {count:,} linear segments, {seconds[-1]:g} s"
+    note = f" ({clipped:,} values clipped to what .4dgs can hold)" if clipped else ""
+    return f"{int(rows.sum()):,} Gaussians in {count:,} linear segments, {seconds[-1]:g} s{note}"
+
+
+def count_clipped(course: Course, still: StillPart) -> int:
+    """Return how many colours and harmonics the format clips at any moment, each counted once."""
+    bytes_ = np.rint(255.0 * course.colors)
+    total = int(((bytes_ < 0) | (bytes_ > 255)).any(axis=0).sum())
+    return total + int((np.abs(np.stack(still.harmonics)) > COEFFICIENT).any(axis=0).sum())
 
 
 def default_view(overview: Overview) -> View:

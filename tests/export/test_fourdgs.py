@@ -134,6 +134,18 @@ def test_the_same_scene_gives_the_same_bytes_and_faults_are_told(tmp_path):
         export_fourdgs(tmp_path / "c.4dgs", scene, None, even_moments(1, FPS), usable)
 
 
+def test_what_is_clipped_is_counted(tmp_path):
+    scene = bar_scene(nodes=12, gaussians=60)
+    with torch.no_grad():
+        scene.gaussians.sh_dc.clamp_(-1.0, 1.0)
+    arguments = scene, None, even_moments(3, FPS), everything(scene)
+    assert "clipped" not in export_fourdgs(tmp_path / "a.4dgs", *arguments)
+    with torch.no_grad():
+        scene.gaussians.sh_dc[7] = torch.tensor([2.0, 0.0, -2.0])
+        scene.gaussians.sh_rest[9, 4, 1] = 4.5
+    assert "(3 values clipped to what .4dgs can hold)" in export_fourdgs(tmp_path / "a.4dgs", *arguments)
+
+
 def test_a_gaussian_that_an_edit_moved_too_far_asks_for_less_of_the_edit(tmp_path):
     session = EditSession(bar_scene(nodes=12, gaussians=60))
     session.add_handle([0, 1, 2], time=0.0, name="end")
