@@ -240,9 +240,11 @@ class DensifyConfig:
     """Visibility pruning without alpha: also remove Gaussians whose distance from a camera is less than this share of
     the distance at which the camera's content begins: they become fog before the lens. 0: off."""
     faint_share: float = newer(0.01, before=0.0, least=0, most=1)
-    """Visibility pruning with alpha, at the end of densification: also remove the Gaussians that contribute least, as
-    many as together have at most this share of all contributions. The contribution of a Gaussian is its largest one to
-    a sampled view. 0: off."""
+    """Visibility pruning with alpha: also remove the Gaussians that contribute least, as many as together have at most
+    this share of all contributions. The contribution of a Gaussian is its largest one to a sampled view. 0: off."""
+    faint_at: Literal["resets", "end"] = newer("resets", before="end")
+    """Rounds of visibility pruning in which these are removed. resets: all. end: only that at the end of
+    densification."""
     prune_large: Literal["auto", "always", "never"] = "auto"
     """Apply max_screen and max_scale. auto: only with alpha; without it, bare walls need large Gaussians."""
     max_screen: float = bounded(0.05, 0, 1e3)

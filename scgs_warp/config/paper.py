@@ -119,6 +119,7 @@ PAPER = TrainConfig(
         least_views=1,
         clear_distance=0.0,
         faint_share=0.0,
+        faint_at="end",
         prune_large="always",
         max_screen=0.0,
         max_scale=0.1,

@@ -138,8 +138,8 @@ def visible_gaussians(state: TrainState, frames: Frames) -> Tensor | None:
 
     These contribute at least ``densify.min_contribution`` pixels to one of the sampled views (to
     ``densify.least_views`` of them if all views are sampled), and no sampled view sees them closer than
-    ``densify.clear_distance``. At the end of densification, the faintest are left out as well
-    (``densify.faint_share``). The views are drawn at random, different ones each time.
+    ``densify.clear_distance``. The faintest are left out as well (``densify.faint_share``, ``densify.faint_at``). The
+    views are drawn at random, different ones each time.
 
     Returns:
         [N] bool, the rows to keep after the present step; None if visibility pruning is not due, or if the run is too
@@ -160,7 +160,7 @@ def visible_gaussians(state: TrainState, frames: Frames) -> Tensor | None:
         keep &= (seen.views >= config.least_views) | seen.most.isinf()
     if config.clear_distance > 0.0:
         keep &= seen.nearest >= config.clear_distance * nearest_content(frames.data, state.normalisation)
-    if done == config.until:
+    if done == config.until or config.faint_at == "resets":
         keep &= ~faintest(seen.most, config.faint_share)
     return keep
 

@@ -62,6 +62,7 @@ def test_best_is_the_former_paper_in_half_the_steps():
         "densify.least_views": 2,
         "densify.clear_distance": 0.25,
         "densify.faint_share": 0.01,
+        "densify.faint_at": "resets",
         "loss.depth": 0.2,
         "loss.stereo": True,
         "loss.random_background": 0.1,

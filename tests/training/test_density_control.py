@@ -207,10 +207,10 @@ def test_the_faintest_share_is_counted_from_below(share, found):
     assert torch.where(faintest(torch.tensor([5.0, 2.0, 1.0, 2.0, torch.inf]), share))[0].tolist() == found
 
 
-@pytest.mark.parametrize("step, due", [(19, False), (39, True)])
-def test_the_faintest_go_at_the_end_of_densification_only(step, due, monkeypatch):
+@pytest.mark.parametrize("step, at, due", [(19, "end", False), (19, "resets", True), (39, "end", True)])
+def test_the_faintest_go_before_resets_or_at_the_end_of_densification(step, at, due, monkeypatch):
     monkeypatch.setattr(density_control, "STEPS_PER_VIEW", 1)
-    state, frames = state_with_hidden_gaussian(faint_share=0.2)
+    state, frames = state_with_hidden_gaussian(faint_share=0.2, faint_at=at)
     least = state.config.densify.min_contribution
     seen = seen_by(state, frames, list(range(6)), least).most
     state.step = step
