@@ -28,6 +28,7 @@ class Purpose:
     TURNS = 44
     SILHOUETTE_PIXELS = 45
     FLOW_FRAME = 46
+    BODY_TURN = 47
     SPLIT_GAUSSIANS = 51
     RESTING_POINTS = 51
     """Without a step, unlike the halves of split Gaussians."""

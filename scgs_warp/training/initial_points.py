@@ -16,6 +16,7 @@ from ..seeding import Purpose, generator
 from ..types import Camera
 from .automatic import has_initial_points
 from .background_points import background_points
+from .body_turn import BodyTurn
 from .frames import first_frames
 from .initial_models import sphere_unit, starts_in_first_pose
 from .points_on_movers import points_on_movers
@@ -49,22 +50,30 @@ class InitialPoints(NamedTuple):
     """Depth of the frames of a rig."""
 
 
-def initial_points(config: TrainConfig, data: Dataset, normalisation: Normalisation) -> InitialPoints:
-    """Choose initial points: those of the data and others about them, or random ones if the data has too few."""
+def initial_points(
+    config: TrainConfig, data: Dataset, normalisation: Normalisation, turn: BodyTurn | None = None
+) -> InitialPoints:
+    """Choose initial points: those of the data and others about them, or random ones if the data has too few.
+
+    Args:
+        turn: that of the subject; random points are then those of the middle instant.
+    """
     count = max(config.init_points, round(sphere_unit(config) * config.pretrain.start_ratio))
     if data.points is None or not has_initial_points(data, config):
-        return _at_random(count, config, data, normalisation)
+        return _at_random(count, config, data, normalisation, turn)
     return _of_data(count, data.points, config, data, normalisation)
 
 
-def _at_random(count: int, config: TrainConfig, data: Dataset, normalisation: Normalisation) -> InitialPoints:
+def _at_random(
+    count: int, config: TrainConfig, data: Dataset, normalisation: Normalisation, turn: BodyTurn | None
+) -> InitialPoints:
     """Draw points where the images are covered; with ``init_random`` cube, grey ones in a cube."""
     if config.init_random == "cube":
         points, colors = random_points(count, config.seed), None
     else:
         # Spheres that start in the pose of the first frames are sampled from these frames only.
         frames = first_frames(data) if starts_in_first_pose(config) and config.pretrain_steps else data
-        points, colors = sample_initial_points(count, frames, normalisation, config.seed)
+        points, colors = sample_initial_points(count, frames, normalisation, config.seed, turn)
     colors = torch.full_like(points, 0.5) if colors is None else colors
     return InitialPoints(points, colors, torch.zeros(len(points), dtype=torch.bool))
 
@@ -108,15 +117,22 @@ class Coverage(NamedTuple):
     """[P, 3] mean colour in the views that cover the point; grey if no view covers it."""
 
 
-def coverage(points: Tensor, data: Dataset, normalisation: Normalisation) -> Coverage | None:
-    """Measure the coverage of ``points`` [P, 3], normalised, in up to 100 frames; return None if no frame has alpha."""
+def coverage(
+    points: Tensor, data: Dataset, normalisation: Normalisation, turn: BodyTurn | None = None
+) -> Coverage | None:
+    """Measure the coverage of ``points`` [P, 3], normalised, in up to 100 frames; return None if no frame has alpha.
+
+    Args:
+        turn: carries the points; None if they rest.
+    """
     chosen = data.with_alpha
     if not chosen:
         return None
     covered, seen, colors = torch.zeros(len(points)), torch.zeros(len(points)), torch.zeros(len(points), 3)
     for index in chosen[:: max(1, len(chosen) // MOST_VIEWS)]:
         frame = data[index]
-        row, column, inside = _pixels(points, normalisation.apply_camera(frame.camera))
+        there = points if turn is None else turn.carry(points, frame.time)
+        row, column, inside = _pixels(there, normalisation.apply_camera(frame.camera))
         assert frame.alpha is not None
         hit = (inside & (frame.alpha[row, column] > 0.5)).float()
         covered += hit
@@ -144,15 +160,18 @@ def common_view(points: Tensor, data: Dataset, normalisation: Normalisation) -> 
 
 
 def sample_initial_points(
-    count: int, data: Dataset, normalisation: Normalisation, seed: int
+    count: int, data: Dataset, normalisation: Normalisation, seed: int, turn: BodyTurn | None = None
 ) -> tuple[Tensor, Tensor | None]:
     """Draw random points where the images are covered or, if no frame has alpha, where the cameras' views overlap.
+
+    Args:
+        turn: carries the points; None if they rest.
 
     Returns:
         points [count, 3], normalised, and colours [count, 3]; the colours are None if no frame has alpha.
     """
     candidates = random_points(max(CANDIDATES, count), seed)
-    covered = coverage(candidates, data, normalisation)
+    covered = coverage(candidates, data, normalisation, turn)
     share = common_view(candidates, data, normalisation) if covered is None else covered.share
     if not bool((share > 0).any()):
         return candidates[:count], None

@@ -235,7 +235,7 @@ class _Run:
         if not total:
             return
         state.save(self.folder.path)
-        bar.print(f"step {state.step}: stage 1 is tried a second time, frame by frame")
+        bar.print(f"step {state.step}: stage 1 is tried a second time")
 
         def go_on(second: TrainState) -> None:
             left = (time.monotonic() - began) / second.step * (total - second.step)
@@ -245,8 +245,13 @@ class _Run:
             if self._stopping():
                 self._end()
 
+        def tell(text: str) -> None:
+            bar.beside(second=text)
+            if self._stopping():
+                self._end()
+
         try:
-            note = try_again(state, self.frames, partial(steps_of, tell=bar.print), go_on)
+            note = try_again(state, self.frames, partial(steps_of, tell=bar.print), go_on, tell)
         except ProcessLost:
             raise
         except StepInterrupted:

@@ -1,8 +1,10 @@
-"""Second try at stage 1: frame by frame, with neighbours of the moment, and with a stiffer ARAP.
+"""Second try at stage 1: with a turn of the whole subject or frame by frame, with neighbours of the moment, and with a
+stiffer ARAP.
 
 **Why.** Images of single moments tell neither which of two legs passes the other nor how far a round head turns, and
-spheres move no further than the images require. The second try adds frame after frame, so that spheres begin in the
-pose of the frame before, and ties each sphere to its neighbours at that moment (``rigidity.momentary_graph``).
+spheres move no further than the images require. If silhouettes show that the subject turns as a whole
+(``body_turn``), the second try begins with this turn. Otherwise it adds frame after frame, so that spheres begin in the
+pose of the frame before. Both tie each sphere to its neighbours of the moment (``rigidity.momentary_graph``).
 
 **Which motion is kept.** The one that shows the training views better: bodies that truly part fit the second try worse.
 But a round head that does not turn, or limbs that have exchanged their places halfway, show the views as well as the
@@ -24,6 +26,7 @@ from ..motion.rigidity import tearing
 from ..motion.spheres import Spheres
 from ..ops.sampling import farthest_points
 from ..runtime.environment import one_piece
+from .body_turn import find_body_turn, learn_turn
 from .density_control import control_density, density_due
 from .frames import Frames
 from .multi_view import check_replicas
@@ -61,6 +64,7 @@ def try_again(
     frames: Frames,
     steps_of: Callable[[TrainState, Frames], Steps],
     go_on: Callable[[TrainState], None],
+    tell: Callable[[str], None] = lambda text: None,
 ) -> str:
     """Train stage 1 a second time, from its beginning, and let ``state`` keep the better spheres.
 
@@ -70,6 +74,7 @@ def try_again(
         state: at the end of stage 1.
         steps_of: returns what takes the steps of a state.
         go_on: called after each step with the state of the second try; raises KeyboardInterrupt to stop.
+        tell: gets what is being done before the first step, from time to time; may raise as well.
 
     Returns:
         What was found, in one line.
@@ -77,7 +82,13 @@ def try_again(
     Raises:
         UserError: an image is no longer readable, or the processes of a group differ.
     """
-    second = TrainState.begin(second_config(state.config), frames.data, str(frames.device))
+    one_body = is_one_piece(frames.data)
+    turn = find_body_turn(frames.data, state.normalisation, tell) if one_body else None
+    config = second_config(state.config, turning=turn is not None)
+    second = TrainState.begin(config, frames.data, str(frames.device), turn)
+    if turn is not None:
+        assert isinstance(second.motion, Spheres)
+        learn_turn(second.motion, second.gaussians.means.detach(), turn, config.seed, tell)
     second.group = state.group
     failed = _train(second, frames, steps_of, go_on)
     if failed is not None:
@@ -85,7 +96,7 @@ def try_again(
     check_replicas(second)
     before, after = shown_psnr(state, frames.data), shown_psnr(second, frames.data)
     better, reason = after > before + LEAST_GAIN, ""
-    if not better and is_one_piece(frames.data):
+    if not better and one_body:
         torn = torn_by(state), torn_by(second)
         most, less = (MOST_LOSS, LESS) if torn[0] > TORN else (CHANCE, FAR_LESS)
         better = after > before - most and torn[1] < less * torn[0]
@@ -97,7 +108,8 @@ def try_again(
         state.exposure, state.exposure_optimizer = second.exposure, second.exposure_optimizer
         state.enter(second.gaussians, second.motion)
     kept = "second" if better else "first"
-    return f"training views: {before:.2f} dB, the second time {after:.2f} dB; the {kept} motion is kept{reason}"
+    how = "frame by frame" if turn is None else f"turned by {turn.total:.0f} degrees, as the silhouettes show"
+    return f"training views: {before:.2f} dB, then {how}: {after:.2f} dB; the {kept} motion is kept{reason}"
 
 
 def _train(

@@ -26,6 +26,7 @@ from ..scene.validation import check_metadata, check_motion, check_resumed, chec
 from ..storage import checkpoint
 from ..types import Stats
 from .automatic import has_initial_points, resolve_auto
+from .body_turn import BodyTurn
 from .camera_refinement import CameraRefinement
 from .depth import depth_applies
 from .exposure import Exposure
@@ -120,11 +121,15 @@ class TrainState:
         self.reset_stats()
 
     @staticmethod
-    def begin(config: TrainConfig, data: Dataset, device: str) -> TrainState:
-        """Make the state at step 0."""
+    def begin(config: TrainConfig, data: Dataset, device: str, turn: BodyTurn | None = None) -> TrainState:
+        """Make the state at step 0.
+
+        Args:
+            turn: that of the subject; stage 1 then begins with points of the middle instant.
+        """
         normalisation, overview, _ = place(data)
         config = resolve_auto(config, data)
-        initial = initial_points(config, data, normalisation)
+        initial = initial_points(config, data, normalisation, turn)
         points, colors = initial.points.to(device), initial.colors.to(device)
         # Cameras that stand still have no extent; the extent of the content is used instead.
         extent = max(data.extent * normalisation.scale, COMMON_RADIUS)

@@ -15,15 +15,12 @@ from scipy.spatial.transform import Rotation
 
 from .round_bodies import RoundBody
 from .turn_views import Views
+from .turn_windows import STRIDE, WINDOW, at_instants, integrated, steadiest, tried_turns, window_starts
 
-WINDOW, STRIDE = 12, 6
-"""Number of instants of a window in which the turn is constant, and from one window to the next."""
 FASTEST, STEP = 7.5, 1.5
 """Largest turn per instant that is tried, and the distance between two that are tried, degrees."""
-STEADY = 1.5
-"""Change of the turn per instant from one window to the next that counts as one unit, degrees."""
 EVIDENCE = 60.0
-"""Weight of the logarithm of a window's residual against these units."""
+"""Weight of the logarithm of a window's residual against changes of the turn (``turn_windows.steadiest``)."""
 LONG = 24
 """Number of instants of the windows by which the turns are refined."""
 FINE = (0.6, 0.3)
@@ -100,61 +97,30 @@ def find_turns(body: RoundBody, views: Views) -> Turns | None:
     rates = _refined(Surface(body, views, offsets), found)
     if np.linalg.norm(rates, axis=1).max() > np.radians(FASTEST + STEP):
         return None
-    rotations = _integrated(rates)
+    rotations = integrated(rates)
     return Turns(rotations @ rotations[views.count // 2].T, clearer)
 
 
 def _clearer(surface: Surface, rates: np.ndarray) -> float:
     """Return the residual of turns per instant, [T - 1, 3], relative to that without turns."""
-    starts = _starts(surface.views.count, WINDOW)
-    still = _cost(surface, starts, WINDOW, _integrated(0.0 * rates))
-    return _cost(surface, starts, WINDOW, _integrated(rates)) / max(still, 1e-12)
-
-
-def _starts(count: int, length: int) -> list[int]:
-    """Return the first instants of windows of ``length`` that cover ``count`` instants, ``STRIDE`` apart."""
-    starts = list(range(0, count - length + 1, STRIDE))
-    return starts if starts[-1] == count - length else [*starts, count - length]
+    starts = window_starts(surface.views.count, WINDOW)
+    still = _cost(surface, starts, WINDOW, integrated(0.0 * rates))
+    return _cost(surface, starts, WINDOW, integrated(rates)) / max(still, 1e-12)
 
 
 def _search(surface: Surface, views: Views) -> np.ndarray:
     """Return the turn per instant, [T - 1, 3] radians: of all turns that are constant in each window, those with small
     residuals that change little from window to window."""
-    axis = np.radians(np.arange(-FASTEST, FASTEST + 1e-6, STEP))
-    rates = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3)
-    rates = rates[np.linalg.norm(rates, axis=1) < np.radians(FASTEST) + 1e-6]
-    starts, costs = _starts(views.count, WINDOW), []
+    rates = tried_turns(FASTEST, STEP)
+    starts, costs = window_starts(views.count, WINDOW), []
     for start in starts:
         window = views.within(start, WINDOW)
         since = views.instants[window.start : window.stop] - (start + 0.5 * (WINDOW - 1))
         rotations = Rotation.from_rotvec((since[:, None, None] * rates).reshape(-1, 3)).as_matrix()
         apart, total = surface.residual(window, rotations.reshape(len(window), len(rates), 3, 3))
         costs.append(EVIDENCE * np.log(np.maximum(apart / np.maximum(total, 1e-12), 1e-6)))
-    change = 0.5 * ((rates[:, None] - rates) ** 2).sum(-1) / np.radians(STEADY) ** 2
-    best, came_from = costs[0], []
-    for cost in costs[1:]:
-        through = best[:, None] + change
-        came_from.append(through.argmin(0))
-        best = through.min(0) + cost
-    path = [int(best.argmin())]
-    for previous in reversed(came_from):
-        path.append(int(previous[path[-1]]))
     middles = np.array(starts) + 0.5 * (WINDOW - 1)
-    return _between(middles, rates[path[::-1]], views.count)
-
-
-def _between(middles: np.ndarray, rates: np.ndarray, count: int) -> np.ndarray:
-    """Interpolate turns per instant [W, 3] at the middles of windows, [count - 1, 3]."""
-    steps = np.arange(count - 1) + 0.5
-    return np.stack([np.interp(steps, middles, rates[:, axis]) for axis in range(3)], 1)
-
-
-def _integrated(rates: np.ndarray) -> np.ndarray:
-    """Return the rotation at each instant, [T, 3, 3], from the turn between neighbouring ones, [T - 1, 3]."""
-    rotations = [np.eye(3)]
-    for turn in Rotation.from_rotvec(rates).as_matrix():
-        rotations.append(turn @ rotations[-1])
-    return np.stack(rotations)
+    return at_instants(middles, rates[steadiest(costs, rates)], views.count)
 
 
 def _cost(surface: Surface, starts: list[int], length: int, rotations: np.ndarray) -> float:
@@ -176,18 +142,18 @@ def _refined(surface: Surface, rates: np.ndarray) -> np.ndarray:
     for step in np.radians(FINE):
         for knot, middle in enumerate(knots):
             first = int(min(max(0, middle - LONG), count - LONG))
-            starts = [start for start in _starts(count, LONG) if first <= start <= middle + STRIDE]
-            best = _cost(surface, starts, LONG, _integrated(_between(knots, values, count)))
+            starts = [start for start in window_starts(count, LONG) if first <= start <= middle + STRIDE]
+            best = _cost(surface, starts, LONG, integrated(at_instants(knots, values, count)))
             for axis in range(3):
                 for change in (step, -step):
                     while True:
                         tried = values.copy()
                         tried[knot, axis] += change
-                        cost = _cost(surface, starts, LONG, _integrated(_between(knots, tried, count)))
+                        cost = _cost(surface, starts, LONG, integrated(at_instants(knots, tried, count)))
                         if cost > best - 1e-5:
                             break
                         values, best = tried, cost
-    return _between(knots, values, count)
+    return at_instants(knots, values, count)
 
 
 def _mean(weights: np.ndarray, values: np.ndarray, axis: int) -> np.ndarray:

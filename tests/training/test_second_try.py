@@ -60,12 +60,16 @@ def test_the_choice_is_made_before_the_first_step(monkeypatch):
 def test_the_settings_of_the_second_try():
     first = preset("cpu")
     first = dataclasses.replace(first, pretrain=dataclasses.replace(first.pretrain, progressive_by="fifth"))
-    second = second_try_config.second_config(first)
+    second = second_try_config.second_config(first, turning=False)
     assert (second.pretrain.progressive, second.pretrain.arap_by) == (True, "moment")
     assert second.pretrain.progressive_by == "frame"
     assert second.pretrain.arap_weight == pytest.approx(10.0 * first.pretrain.arap_weight)
     same = {name: getattr(first.pretrain, name) for name in ("progressive", "progressive_by", "arap_by", "arap_weight")}
     assert dataclasses.replace(second, pretrain=dataclasses.replace(second.pretrain, **same)) == first
+    turned = second_try_config.second_config(first, turning=True).pretrain
+    assert turned == dataclasses.replace(
+        first.pretrain, arap_by="moment", arap_weight=second.pretrain.arap_weight, warm_up=300
+    )
     assert preset("paper").pretrain.arap_by == "track"
     assert preset("quick").pretrain.progressive, "which rules a second try out"
 
@@ -237,7 +241,7 @@ def test_a_run_that_is_stopped_in_the_second_try_gives_the_same_bits(stop_at, tr
     whole = (tmp_path / "whole/checkpoint.safetensors").read_bytes()
     again = loop.try_again
 
-    def interrupted(state, frames, steps_of, go_on):
+    def interrupted(state, frames, steps_of, go_on, tell):
         if stop_at == 0:  # the process is killed at once
             raise RuntimeError
 
@@ -246,7 +250,7 @@ def test_a_run_that_is_stopped_in_the_second_try_gives_the_same_bits(stop_at, tr
                 os.kill(os.getpid(), signal.SIGTERM)
             go_on(second)
 
-        return again(state, frames, steps_of, signalled)
+        return again(state, frames, steps_of, signalled, tell)
 
     with monkeypatch.context() as patch, pytest.raises(RuntimeError if stop_at == 0 else KeyboardInterrupt):
         patch.setattr(loop, "try_again", interrupted)
