@@ -177,6 +177,9 @@ class PretrainConfig:
     """Choice of ARAP's neighbours. track: those over the whole time (supplement). moment: those at the first of the two
     times compared, less those that part. auto: track; then, for cut-out subjects that are not thin, stage 1 is trained
     a second time with moment (``training.second_try``)."""
+    body_turn: bool = newer(True, before=False)
+    """Look for a turn of the whole subject in its silhouettes, where stage 1 may be trained a second time; if one is
+    found, that begins with it (``training.body_turn``, not in the paper)."""
     random_background: bool = True
     """Change the background in every step if the data has alpha: black cloth is then not taken for empty space."""
     silhouette: float = newer(0.5, before=0.0, least=0, most=1e6)

@@ -72,6 +72,7 @@ PAPER = TrainConfig(
         arap_by="track",
         random_background=True,
         silhouette=0.0,
+        body_turn=False,
         pooled=False,
         fade="always",
         progressive=False,

@@ -11,33 +11,27 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import NamedTuple
 
-import cv2
 import numpy as np
 import torch
 from scipy.spatial.transform import Rotation
 from torch import Tensor
 
-from ..data.dataset import Dataset, spread
+from ..data.dataset import Dataset
 from ..geometry.normalisation import Normalisation
 from ..motion.spheres import Spheres
 from ..optim import Adam, log_linear
 from ..seeding import Purpose, generator
 from .turn_windows import WINDOW, at_instants, integrated, steadiest, tried_turns, window_starts
+from .visual_hull import Outline, Window, read_outlines, steady_window, unfilled, window_along
 
-SIZE = 48
-"""Width in pixels to which silhouettes are reduced."""
-INSIDE = 0.3
-"""Covered share of a reduced pixel from which it belongs to the silhouette."""
-ACROSS = 28
-"""Number of places across the subject, along each axis, from which the hull is made."""
-VIEWS = 24
-"""Largest number of views of a window that are compared."""
-OUTSIDE = 1 / 12
-"""Share of a window's views in which a place of the hull may lie outside the silhouette: limbs move by themselves."""
 FASTEST = 5.0
 """Largest turn per instant that is tried, degrees."""
 ROUGH, FINE = 2.5, 1.0
 """Distances between tried turns, degrees per instant: to tell whether the subject turns, and by how much."""
+LONG = 24
+"""Number of instants of the windows by which the turns are refined."""
+STEPS_OF_TURNS, MOST_MOVES = (1.0, 0.5), 4
+"""Steps of the refinement in degrees per instant, one round each, and largest number of them at one place."""
 EVIDENCE = 10.0
 """Weight of the logarithm of a window's unfilled share against changes of the turn (``turn_windows.steadiest``)."""
 LEAST = 0.2
@@ -80,49 +74,9 @@ class BodyTurn(NamedTuple):
         return float(np.degrees(max((quats * one.inv()).magnitude().max() for one in quats)))
 
 
-class Outline(NamedTuple):
-    """Silhouette of a training view."""
-
-    instant: int
-    viewmat: np.ndarray
-    """[4, 4] world-to-camera, normalised."""
-    K: np.ndarray
-    """[3, 3] for the pixels of ``covered``."""
-    covered: np.ndarray
-    """[h, w] float32, covered share of each pixel."""
-
-    def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Project points [..., 3]; return columns, rows (0 is the centre of the first pixel) and depths, [...] each."""
-        x, y, depth = np.moveaxis(points @ self.viewmat[:3, :3].T + self.viewmat[:3, 3], -1, 0)
-        depth = np.maximum(depth, 1e-6)
-        return self.K[0, 0] * x / depth + self.K[0, 2] - 0.5, self.K[1, 1] * y / depth + self.K[1, 2] - 0.5, depth
-
-    def ray(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the centre of projection and the direction to the centroid of the silhouette, [3] each."""
-        rows, columns = np.mgrid[: self.covered.shape[0], : self.covered.shape[1]] + 0.5
-        total = max(float(self.covered.sum()), 1e-9)
-        x, y = float((self.covered * columns).sum()) / total, float((self.covered * rows).sum()) / total
-        direction = np.array([(x - self.K[0, 2]) / self.K[0, 0], (y - self.K[1, 2]) / self.K[1, 1], 1.0])
-        direction = self.viewmat[:3, :3].T @ direction
-        return -self.viewmat[:3, :3].T @ self.viewmat[:3, 3], direction / np.linalg.norm(direction)
-
-
-class Window(NamedTuple):
-    """Some views, and where the subject is in them if it moves steadily."""
-
-    outlines: list[Outline]
-    since: np.ndarray
-    """[V] instants since the middle of the window."""
-    centre: np.ndarray
-    """[3] at the middle."""
-    speed: np.ndarray
-    """[3] per instant."""
-    radius: float
-
-
 def turns_round(data: Dataset, normalisation: Normalisation) -> bool:
     """Return whether the subject of images with alpha turns as a whole."""
-    windows = _windows(data, normalisation)
+    windows = _windows(read_outlines(data, normalisation), len(data.times.unique()))
     return bool(windows) and _gain(windows, ROUGH)[0] >= LEAST
 
 
@@ -137,17 +91,29 @@ def find_body_turn(
     Raises:
         UserError: an image is no longer readable.
     """
-    windows = _windows(data, normalisation)
+    times = data.times.double().unique().numpy()
+    count, outlines = len(times), read_outlines(data, normalisation)
+    windows = _windows(outlines, count)
     if not windows or _gain(windows, ROUGH)[0] < LEAST:
         return None
     turns = _gain(windows, FINE, tell)[1]
-    times = data.times.double().unique().numpy()
-    count, middles = len(times), np.array(window_starts(len(times), WINDOW)) + 0.5 * (WINDOW - 1)
-    rotations = integrated(at_instants(middles, turns, count))
-    centres = np.stack([window.centre for window in windows])
+    middles = np.array(window_starts(count, WINDOW)) + 0.5 * (WINDOW - 1)
+    centres = np.stack([window.centres.mean(0) for window in windows])
     centres = np.stack([np.interp(np.arange(count), middles, centres[:, axis]) for axis in range(3)], 1)
     radius = float(np.median([window.radius for window in windows]))
+    long = [window_along(outlines, start, LONG, centres, radius) for start in window_starts(count, LONG)]
+    rotations = integrated(at_instants(middles, _refined(long, middles, turns, count, tell), count))
     return BodyTurn(times, rotations @ rotations[count // 2].T, centres, radius)
+
+
+def _windows(outlines: list[Outline], count: int) -> list[Window]:
+    """Return the windows that cover ``count`` instants; none if there are too few or too many of them, or if one hardly
+    shows the subject."""
+    if not 2 * WINDOW <= count <= MOST_INSTANTS:
+        return []
+    windows = [steady_window(outlines, start, WINDOW) for start in window_starts(count, WINDOW)]
+    shown = [window for window in windows if window is not None]
+    return shown if len(shown) == len(windows) else []
 
 
 def _gain(
@@ -156,123 +122,49 @@ def _gain(
     """Return the mean decrease of the logarithm of the unfilled share relative to no turn, and the turn per instant of
     each window [W, 3], for turns that are ``step`` degrees apart."""
     turns = tried_turns(FASTEST, step)
-    unfilled = []
+    costs = []
     for number, window in enumerate(windows):
         tell(f"turn of the subject, {number}/{len(windows)}")
-        unfilled.append(np.log(_unfilled(window, turns)))
+        costs.append(np.log(unfilled(window, _steady(window, turns))))
     still = int(np.linalg.norm(turns, axis=1).argmin())
-    chosen = steadiest([EVIDENCE * cost for cost in unfilled], turns)
-    gain = np.mean([cost[still] - cost[index] for cost, index in zip(unfilled, chosen, strict=True)])
+    chosen = steadiest([EVIDENCE * cost for cost in costs], turns)
+    gain = np.mean([cost[still] - cost[index] for cost, index in zip(costs, chosen, strict=True)])
     return float(gain), turns[chosen]
 
 
-def _windows(data: Dataset, normalisation: Normalisation) -> list[Window]:
-    """Return the windows that cover all instants, ``STRIDE`` apart; none if there are too few or too many instants."""
-    count = len(data.times.unique())
-    if not 2 * WINDOW <= count <= MOST_INSTANTS:
-        return []
-    outlines = _outlines(data, normalisation)
-    windows = []
-    for start in window_starts(count, WINDOW):
-        inside = [one for one in outlines if start <= one.instant < start + WINDOW and one.covered.any()]
-        if len(inside) < WINDOW // 2:
-            return []
-        windows.append(_window([inside[index] for index in spread(len(inside), VIEWS)], start))
-    return windows
+def _refined(
+    windows: list[Window], middles: np.ndarray, turns: np.ndarray, count: int, tell: Callable[[str], None]
+) -> np.ndarray:
+    """Improve turns per instant [W, 3] at ``middles``, step by step over long windows, in which errors add up."""
+    turns = turns.copy()
+    for step in np.radians(STEPS_OF_TURNS):
+        for knot, middle in enumerate(middles):
+            tell(f"turn of the subject, refined {knot}/{len(middles)}")
+            near = [one for one in windows if abs(one.instants.mean() - middle) <= 0.5 * LONG]
+            moves = step * np.concatenate([np.zeros((1, 3)), np.eye(3), -np.eye(3)])
+            for _ in range(MOST_MOVES):
+                tried = np.repeat(turns[None], len(moves), 0)
+                tried[:, knot] += moves
+                rotations = np.stack([integrated(at_instants(middles, each, count)) for each in tried], 1)
+                cost = np.sum([np.log(unfilled(one, _about_middle(one, rotations))) for one in near], axis=0)
+                best = int(cost.argmin())
+                if best == 0:
+                    break
+                turns = tried[best]
+    return turns
 
 
-def _outlines(data: Dataset, normalisation: Normalisation) -> list[Outline]:
-    """Read the silhouettes of all frames with alpha, in the order of their instants."""
-    times = data.times.double()
-    instants = np.searchsorted(times.unique().numpy(), times.numpy())
-    outlines = []
-    for index in sorted(data.with_alpha, key=lambda index: instants[index]):
-        frame = data[index]
-        assert frame.alpha is not None
-        camera = normalisation.apply_camera(frame.camera)
-        share = SIZE / camera.width
-        size = SIZE, max(1, round(camera.height * share))
-        covered = cv2.resize(frame.alpha.numpy(), size, interpolation=cv2.INTER_AREA)
-        K = np.diag([share, size[1] / camera.height, 1.0]) @ camera.K.double().numpy()
-        outlines.append(Outline(int(instants[index]), camera.viewmat.double().numpy(), K, covered))
-    return outlines
+def _about_middle(window: Window, rotations: np.ndarray) -> np.ndarray:
+    """Return rotations [V, H, 3, 3] from the view in the middle of a window to each, of those at all instants
+    [T, H, 3, 3]."""
+    here = rotations[window.instants]
+    return here @ here[window.middle].transpose(0, 2, 1)
 
 
-def _window(outlines: list[Outline], start: int) -> Window:
-    """Place the subject so that it passes steadily through the rays to the centroids of the silhouettes."""
-    since = np.array([one.instant for one in outlines]) - (start + 0.5 * (WINDOW - 1))
-    matrix, right = 1e-6 * np.eye(6), np.zeros(6)
-    for one, when in zip(outlines, since, strict=True):
-        eye, direction = one.ray()
-        across = np.eye(3) - np.outer(direction, direction)
-        moving = np.hstack([np.eye(3), when * np.eye(3)])
-        matrix += moving.T @ across @ moving
-        right += moving.T @ across @ eye
-    solved = np.linalg.solve(matrix, right)
-    centre, speed = solved[:3], solved[3:]
-    return Window(outlines, since, centre, speed, _radius(outlines, since, centre, speed))
-
-
-def _radius(outlines: list[Outline], since: np.ndarray, centre: np.ndarray, speed: np.ndarray) -> float:
-    """Return the median distance from the centre to the farthest pixel of a silhouette, normalised."""
-    farthest = []
-    for one, when in zip(outlines, since, strict=True):
-        x, y, depth = one.project(centre + when * speed)
-        rows, columns = np.nonzero(one.covered > INSIDE)
-        pixels = np.hypot(columns - x, rows - y).max(initial=0.0)
-        farthest.append(pixels * depth / one.K[0, 0])
-    return float(np.median(farthest))
-
-
-def _unfilled(window: Window, turns: np.ndarray) -> np.ndarray:
-    """Return the share [H] of the silhouettes that the hull does not fill under each of ``turns`` [H, 3]."""
-    axis = window.radius * np.linspace(-1.0, 1.0, ACROSS)
-    places = np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), -1).reshape(-1, 3)
-    places = places[np.linalg.norm(places, axis=1) < window.radius]
-    # The nearest view to the middle sees the hull under all turns alike.
-    middle = int(np.abs(window.since).argmin())
-    places = places[_looked_up(window, middle, places)[1]]
-    pixels, inside = [], np.zeros((len(turns), len(places)), np.int32)
-    for view, when in enumerate(window.since):
-        rotations = Rotation.from_rotvec(when * turns).as_matrix()
-        pixel, within = _looked_up(window, view, places @ rotations.transpose(0, 2, 1))
-        pixels.append(pixel)
-        inside += within
-    hull = inside >= len(pixels) - int(OUTSIDE * len(pixels))
-    filled = np.zeros(len(turns))
-    for one, pixel in zip(window.outlines, pixels, strict=True):
-        filled += _filled(one.covered, pixel, hull)
-    total = sum(float(one.covered.sum()) for one in window.outlines)
-    return np.maximum(1.0 - filled / total, 1e-4)
-
-
-def _looked_up(window: Window, view: int, offsets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Look up places by their offsets [..., 3] from the centre; return the index of their pixel and whether it is
-    inside the silhouette, [...]."""
-    one = window.outlines[view]
-    x, y, _ = one.project(offsets + window.centre + window.since[view] * window.speed)
-    height, width = one.covered.shape
-    column, row = np.rint(x).astype(np.int32), np.rint(y).astype(np.int32)
-    shown = (column >= 0) & (column < width) & (row >= 0) & (row < height)
-    pixel = row.clip(0, height - 1) * width + column.clip(0, width - 1)
-    return pixel, shown & (one.covered.reshape(-1)[pixel] > INSIDE)
-
-
-def _filled(covered: np.ndarray, pixel: np.ndarray, hull: np.ndarray) -> np.ndarray:
-    """Sum the silhouette over the pixels at and beside places of the hull, [H].
-
-    Args:
-        pixel: [H, n] pixel of each place.
-        hull: [H, n] bool, the places that belong to the hull.
-    """
-    height, width = covered.shape
-    shown = np.zeros((len(hull), height * width), np.uint8)
-    which, place = np.nonzero(hull)
-    shown[which, pixel[which, place]] = 1
-    # An empty row and column beside each picture keeps the pictures of a stack apart.
-    stack = np.pad(shown.reshape(-1, height, width), ((0, 0), (0, 1), (0, 1))).reshape(-1, width + 1)
-    wide = cv2.dilate(stack, np.ones((3, 3), np.uint8)).reshape(-1, height + 1, width + 1)
-    return (wide[:, :height, :width] * covered).sum((1, 2), dtype=np.float64)
+def _steady(window: Window, turns: np.ndarray) -> np.ndarray:
+    """Return the rotations [V, H, 3, 3] of each view under turns [H, 3] that are constant in a window."""
+    vectors = window.since[:, None, None] * turns
+    return Rotation.from_rotvec(vectors.reshape(-1, 3)).as_matrix().reshape(*vectors.shape, 3)
 
 
 def learn_turn(

@@ -83,7 +83,9 @@ def try_again(
         UserError: an image is no longer readable, or the processes of a group differ.
     """
     one_body = is_one_piece(frames.data)
-    turn = find_body_turn(frames.data, state.normalisation, tell) if one_body else None
+    turn = (
+        find_body_turn(frames.data, state.normalisation, tell) if state.config.pretrain.body_turn and one_body else None
+    )
     config = second_config(state.config, turning=turn is not None)
     second = TrainState.begin(config, frames.data, str(frames.device), turn)
     if turn is not None:

@@ -31,7 +31,7 @@ def may_be_tried_again(config: TrainConfig, data: Dataset, thin: bool) -> bool:
         return False
     if config.pretrain_steps >= LEAST_VISITS * len(data):
         return True
-    turns = config.pretrain_steps >= LEAST_STEPS and is_one_piece(data)
+    turns = pretrain.body_turn and config.pretrain_steps >= LEAST_STEPS and is_one_piece(data)
     return turns and turns_round(data, place(data).normalisation)
 
 

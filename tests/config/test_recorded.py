@@ -48,6 +48,7 @@ def test_best_is_the_former_paper_in_half_the_steps():
         "pretrain.arap_by": "auto",
         "pretrain.fade": "auto",
         "pretrain.pooled": True,
+        "pretrain.body_turn": True,
         "motion.correctives": True,
         "optim.correctives": 8e-4,
         "motion.tints": True,

@@ -79,8 +79,8 @@ def found(spun) -> BodyTurn:
 
 def test_the_turn_is_found(found):
     assert len(found.times) == len(found.rotations) == len(found.centres) == INSTANTS
-    true = np.stack([Rotation.align_vectors(*(spinning(i) - spinning(i)[:1] for i in (t, 20)))[0].as_matrix()
-                     for t in range(INSTANTS)])  # fmt: skip
+    spread = [spinning(instant) - spinning(instant)[0] for instant in range(INSTANTS)]
+    true = np.stack([Rotation.align_vectors(one, spread[INSTANTS // 2])[0].as_matrix() for one in spread])
     off = np.degrees(Rotation.from_matrix(found.rotations @ true.transpose(0, 2, 1)).magnitude())
     assert off.max() < 15.0 and np.median(off) < 8.0, "of 117 degrees"
     assert found.total == pytest.approx(117.0, abs=15.0)
