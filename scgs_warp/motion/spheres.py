@@ -57,9 +57,9 @@ class Spheres(Motion):
         self.takes_time_tensor = isinstance(network, DeformationNetwork)
         self.log_radius = nn.Parameter(torch.tensor([[radius]]).log())
         self.graph: Graph | None = None
-        self.led = False
-        """True if the network begins with a motion. Until ``warm_up``, it then stays as it is, while the spheres take
-        their colours; otherwise the spheres rest."""
+        self.held = 0
+        """Number of first steps in which a network that begins with a motion stays as it is, while the spheres take
+        their places and colours."""
 
     def translations(self, positions: Tensor, times: Tensor) -> Tensor:
         """Return displacements [T, n, 3] of ``positions`` [n, 3]. The positions are detached, because gradients through
@@ -78,10 +78,9 @@ class Spheres(Motion):
     def plan(
         self, gaussians: GaussianParameters, time: float, step: int, config: TrainConfig, view: int = 0
     ) -> MotionStep:
-        early = step < config.pretrain.warm_up
-        if early and not self.led:
+        if step < config.pretrain.warm_up:
             return MotionStep((time,), phase="rest")
-        if early or not self._compares(step, config):
+        if not self._compares(step, config):
             return MotionStep((time,))
         others = arap_times(
             config.loss, generator(config.seed, Purpose.ARAP_TIMES_OF_SPHERES, step * config.batch + view)
@@ -125,8 +124,7 @@ class Spheres(Motion):
         return config.pretrain.arap_weight > 0 and step % config.loss.arap_every == 0
 
     def rates(self, step: int, config: TrainConfig) -> dict[str, float]:
-        held = self.led and step < config.pretrain.warm_up
-        rate = 0.0 if held else network_rate(step, config.pretrain.warm_up, config.optim)
+        rate = 0.0 if step < self.held else network_rate(step, config.pretrain.warm_up, config.optim)
         rates = {name: rate for name, _ in self.named_parameters() if name.startswith("network.")}
         return {**rates, "log_radius": config.optim.scales}
 

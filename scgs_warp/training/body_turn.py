@@ -168,11 +168,18 @@ def _steady(window: Window, turns: np.ndarray) -> np.ndarray:
 
 
 def learn_turn(
-    spheres: Spheres, points: Tensor, turn: BodyTurn, seed: int, tell: Callable[[str], None] = lambda text: None
+    spheres: Spheres,
+    points: Tensor,
+    turn: BodyTurn,
+    held: int,
+    seed: int,
+    tell: Callable[[str], None] = lambda text: None,
 ) -> None:
     """Train the network to carry ``points`` [P, 3] of the middle instant along the turn, in place.
 
     Args:
+        held: number of first steps of stage 1 in which the network stays as it is: gradients of spheres that have not
+            found their colours yet would undo the turn.
         tell: gets what is being done, from time to time.
     """
     random = generator(seed, Purpose.BODY_TURN)
@@ -193,4 +200,4 @@ def learn_turn(
         loss.backward()
         optimizer.step()
     optimizer.zero_grad()
-    spheres.led = True
+    spheres.held = held

@@ -30,7 +30,7 @@ from .body_turn import find_body_turn, learn_turn
 from .density_control import control_density, density_due
 from .frames import Frames
 from .multi_view import check_replicas
-from .second_try_config import second_config
+from .second_try_config import HELD, second_config
 from .silhouettes import is_one_piece
 from .state import StepResult, TrainState
 from .stepping import Steps, take_step
@@ -90,7 +90,8 @@ def try_again(
     second = TrainState.begin(config, frames.data, str(frames.device), turn)
     if turn is not None:
         assert isinstance(second.motion, Spheres)
-        learn_turn(second.motion, second.gaussians.means.detach(), turn, config.seed, tell)
+        held = round(HELD * config.pretrain_steps)
+        learn_turn(second.motion, second.gaussians.means.detach(), turn, held, config.seed, tell)
     second.group = state.group
     failed = _train(second, frames, steps_of, go_on)
     if failed is not None:

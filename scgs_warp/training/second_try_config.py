@@ -42,7 +42,7 @@ def second_config(config: TrainConfig, *, turning: bool) -> TrainConfig:
         turning: the spheres begin with a turn of the whole subject; otherwise they follow frame by frame.
     """
     pretrain = config.pretrain
-    how = {"warm_up": round(HELD * pretrain.steps)} if turning else {"progressive": True, "progressive_by": "frame"}
+    how = {"warm_up": 0} if turning else {"progressive": True, "progressive_by": "frame"}
     weight = STIFFER * pretrain.arap_weight
     changed = dataclasses.replace(pretrain, arap_by="moment", arap_weight=weight, **how)
     return dataclasses.replace(config, pretrain=changed)

@@ -68,7 +68,7 @@ def test_the_settings_of_the_second_try():
     assert dataclasses.replace(second, pretrain=dataclasses.replace(second.pretrain, **same)) == first
     turned = second_try_config.second_config(first, turning=True).pretrain
     assert turned == dataclasses.replace(
-        first.pretrain, arap_by="moment", arap_weight=second.pretrain.arap_weight, warm_up=300
+        first.pretrain, arap_by="moment", arap_weight=second.pretrain.arap_weight, warm_up=0
     )
     assert preset("paper").pretrain.arap_by == "track"
     assert preset("quick").pretrain.progressive, "which rules a second try out"
