@@ -370,6 +370,7 @@ WRITERS: dict[str, Callable[[Source], str]] = {
     "depth": depth,
     "crossing": crossing,
     "second-try": motion_before_and_after("one try", "two tries"),
+    "body-turn": motion_before_and_after("without the turn", "with the turn"),
     "turns": motion_before_and_after("without turns", "with turns"),
     "clips": clips,
     "gallery": gallery,

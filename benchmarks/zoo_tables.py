@@ -189,7 +189,7 @@ def motion_before_and_after(before: str, after: str) -> Callable[[Source], str]:
     def write(source: Source) -> str:
         rows = [source.label("before", before), source.label("after", after)]
         lines = []
-        for scene in (*ZOO, "figure-seed-1", "balls-6000"):
+        for scene in (*ZOO, "figure-seed-1", "balls-6000", "BrainStem"):
             runs = source.run("before", scene), source.run("after", scene)
             if all(runs):
                 cells = [number(run.get(key), 2) for key in ("epe", "psnr", "psnr_worst") for run in runs]
