@@ -201,6 +201,9 @@ def _remove_leftovers(path: Path) -> None:
         names = [entry.name for entry in os.scandir(path.parent) if pattern.fullmatch(entry.name)]
         for left in (path.with_name(name) for name in names):
             with suppress(OSError):
+                if left.is_symlink():  # no writer makes a link; its target is not touched
+                    left.unlink()
+                    continue
                 number = os.open(left, os.O_RDONLY | os.O_NONBLOCK | os.O_NOFOLLOW)
                 try:
                     fcntl.flock(number, fcntl.LOCK_EX | fcntl.LOCK_NB)

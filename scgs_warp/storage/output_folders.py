@@ -100,6 +100,9 @@ def write_folder_atomically(folder: Path, write: Callable[[Path], None]) -> None
         raise UserError(f"{folder}: is the current folder or contains it; name a new folder")
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UserError(f"{folder}: cannot be made ({error.strerror}); choose a folder that can be written") from None
+    try:
         with new_beside(folder, folder=True) as work:
             write(work)
             replace_folder(folder, work)
