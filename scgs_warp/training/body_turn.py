@@ -36,6 +36,9 @@ EVIDENCE = 10.0
 """Weight of the logarithm of a window's unfilled share against changes of the turn (``turn_windows.steadiest``)."""
 LEAST = 0.2
 """Mean decrease of this logarithm, relative to no turn, from which the subject is said to turn."""
+ONE_SIDED = 0.9
+"""Length of the mean direction to the cameras of a window above which they stand on one side: the hull is then open
+towards them, and almost any turn fits."""
 MOST_INSTANTS = 1000
 """Largest number of instants with which the turn is looked for, so that this takes minutes at most."""
 STEPS, POINTS = 2500, 400
@@ -108,11 +111,11 @@ def find_body_turn(
 
 def _windows(outlines: list[Outline], count: int) -> list[Window]:
     """Return the windows that cover ``count`` instants; none if there are too few or too many of them, or if one hardly
-    shows the subject."""
+    shows the subject, or from one side only."""
     if not 2 * WINDOW <= count <= MOST_INSTANTS:
         return []
     windows = [steady_window(outlines, start, WINDOW) for start in window_starts(count, WINDOW)]
-    shown = [window for window in windows if window is not None]
+    shown = [window for window in windows if window is not None and window.one_sided <= ONE_SIDED]
     return shown if len(shown) == len(windows) else []
 
 

@@ -8,6 +8,14 @@ import cv2
 import numpy as np
 
 
+def project(viewmat: np.ndarray, K: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Project points [..., 3] by a camera [4, 4] and [3, 3]; return columns, rows (0 is the centre of the first pixel)
+    and depths, [...] each. Points behind the camera get a depth of 1e-6."""
+    x, y, depth = np.moveaxis(points @ viewmat[:3, :3].T + viewmat[:3, 3], -1, 0)
+    depth = np.maximum(depth, 1e-6)
+    return K[0, 0] * x / depth + K[0, 2] - 0.5, K[1, 1] * y / depth + K[1, 2] - 0.5, depth
+
+
 class Views(NamedTuple):
     """The training views, ordered by instant."""
 
@@ -38,11 +46,8 @@ class Views(NamedTuple):
         return -viewmat[:3, :3].T @ viewmat[:3, 3]
 
     def project(self, view: int, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Project points [..., 3]; return columns, rows (0 is the centre of the first pixel) and depths, [...] each."""
-        viewmat, K = self.viewmats[view], self.intrinsics[view]
-        x, y, depth = np.moveaxis(points @ viewmat[:3, :3].T + viewmat[:3, 3], -1, 0)
-        depth = np.maximum(depth, 1e-6)
-        return K[0, 0] * x / depth + K[0, 2] - 0.5, K[1, 1] * y / depth + K[1, 2] - 0.5, depth
+        """Project points [..., 3] into a view (:func:`project`)."""
+        return project(self.viewmats[view], self.intrinsics[view], points)
 
     def color_at(self, view: int, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         """Return the colours [H, n, 3] at columns and rows [H, n], between pixels by linear interpolation."""

@@ -9,6 +9,7 @@ import numpy as np
 
 from ..data.dataset import Dataset, spread
 from ..geometry.normalisation import Normalisation
+from .turn_views import project
 
 SIZE = 48
 """Width in pixels to which silhouettes are reduced."""
@@ -34,10 +35,8 @@ class Outline(NamedTuple):
     """[h, w] float32, covered share of each pixel."""
 
     def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Project points [..., 3]; return columns, rows (0 is the centre of the first pixel) and depths, [...] each."""
-        x, y, depth = np.moveaxis(points @ self.viewmat[:3, :3].T + self.viewmat[:3, 3], -1, 0)
-        depth = np.maximum(depth, 1e-6)
-        return self.K[0, 0] * x / depth + self.K[0, 2] - 0.5, self.K[1, 1] * y / depth + self.K[1, 2] - 0.5, depth
+        """Project points [..., 3] (``turn_views.project``)."""
+        return project(self.viewmat, self.K, points)
 
     def ray(self) -> tuple[np.ndarray, np.ndarray]:
         """Return the centre of projection and the direction to the centroid of the silhouette, [3] each."""
@@ -63,6 +62,12 @@ class Window(NamedTuple):
     def instants(self) -> np.ndarray:
         """[V] instant of each view."""
         return np.array([one.instant for one in self.outlines])
+
+    @property
+    def one_sided(self) -> float:
+        """Length of the mean of the unit vectors from the subject to the cameras: 1 if all stand in one direction."""
+        towards = np.stack([one.ray()[0] for one in self.outlines]) - self.centres
+        return float(np.linalg.norm((towards / np.linalg.norm(towards, axis=1, keepdims=True)).mean(0)))
 
     @property
     def middle(self) -> int:
@@ -160,7 +165,7 @@ def _looked_up(window: Window, view: int, offsets: np.ndarray) -> tuple[np.ndarr
     one = window.outlines[view]
     x, y, _ = one.project(offsets + window.centres[view])
     height, width = one.covered.shape
-    column, row = np.rint(x).astype(np.int32), np.rint(y).astype(np.int32)
+    column, row = np.rint(x.clip(-1, width)).astype(np.int32), np.rint(y.clip(-1, height)).astype(np.int32)
     shown = (column >= 0) & (column < width) & (row >= 0) & (row < height)
     pixel = row.clip(0, height - 1) * width + column.clip(0, width - 1)
     return pixel, shown & (one.covered.reshape(-1)[pixel] > INSIDE)
