@@ -6,6 +6,7 @@ import contextlib
 import functools
 import inspect
 import sys
+import threading
 from collections.abc import Callable, Iterator
 from typing import Any, ParamSpec, TypeVar
 
@@ -17,6 +18,12 @@ Kind = TypeVar("Kind")
 
 KINDS = ("cpu", "cuda")
 """Kinds of devices that may have autocast."""
+
+_lock = threading.Lock()
+_guests = 0
+"""Number of calls under way that need float32 as default type, which is that of all threads."""
+_callers_dtype = torch.float32
+"""Default type before the first of them."""
 
 
 def unaffected(function: Callable[Parameters, Result]) -> Callable[Parameters, Result]:
@@ -51,8 +58,9 @@ def unaffected_methods(kind: type[Kind]) -> type[Kind]:
 
 
 def _as_usual() -> bool:
-    plain = torch.get_default_dtype() is torch.float32 and torch.get_default_device().type == "cpu"
-    return plain and not any(map(torch.is_autocast_enabled, KINDS))
+    with _lock:
+        plain = not _guests and torch.get_default_dtype() is torch.float32
+    return plain and torch.get_default_device().type == "cpu" and not any(map(torch.is_autocast_enabled, KINDS))
 
 
 @contextlib.contextmanager
@@ -61,6 +69,24 @@ def _usual_settings() -> Iterator[None]:
         for kind in filter(torch.is_autocast_enabled, KINDS):
             stack.enter_context(torch.autocast(kind, enabled=False))
         stack.enter_context(torch.device("cpu"))
-        stack.callback(torch.set_default_dtype, torch.get_default_dtype())
-        torch.set_default_dtype(torch.float32)
+        stack.enter_context(_float32_by_default())
         yield
+
+
+@contextlib.contextmanager
+def _float32_by_default() -> Iterator[None]:
+    """Make float32 the default type until the last of the calls that overlap has ended: a shorter call of another
+    thread must not give the caller's type back meanwhile."""
+    global _guests, _callers_dtype
+    with _lock:
+        if not _guests:
+            _callers_dtype = torch.get_default_dtype()
+            torch.set_default_dtype(torch.float32)
+        _guests += 1
+    try:
+        yield
+    finally:
+        with _lock:
+            _guests -= 1
+            if not _guests:
+                torch.set_default_dtype(_callers_dtype)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import threading
+
 import pytest
 import torch
 
@@ -33,6 +35,30 @@ def test_an_error_gives_the_settings_back():
         with pytest.raises(ValueError, match="as asked"):
             fails()
         assert torch.get_default_dtype() is torch.float64
+
+
+def test_calls_of_threads_may_overlap():
+    """The default type is that of all threads: the call that ends first must not take float32 from the other."""
+    begun, overlapping, seen = threading.Event(), threading.Event(), []
+
+    @unaffected
+    def first() -> None:
+        begun.set()
+        overlapping.wait(30)
+
+    @unaffected
+    def second() -> None:
+        overlapping.set()
+        thread.join(30)
+        seen.append(torch.ones(1).dtype)
+
+    with default_dtype():
+        thread = threading.Thread(target=first)
+        thread.start()
+        begun.wait(30)
+        second()
+        assert torch.get_default_dtype() is torch.float64
+    assert seen == [torch.float32]
 
 
 def test_the_compiler_leaves_it_as_it_is():
