@@ -130,9 +130,13 @@ def configured() -> bool:
 
 
 def ensure_configured() -> None:
-    """Call :func:`configure` with its defaults, unless it was called before."""
+    """Call :func:`configure` with its defaults, unless it was called before, and flush denormals in this thread, too:
+    one that began earlier does not, and would round unlike its helpers."""
     if not _configured:
         configure()
+    import torch
+
+    torch.set_flush_denormal(True)
 
 
 def _keep_freed_memory() -> None:

@@ -7,6 +7,7 @@ import math
 import os
 import subprocess
 import sys
+import threading
 
 import pytest
 import torch
@@ -79,6 +80,22 @@ def test_activations_of_many_gaussians_have_the_same_bits_on_any_number_of_threa
         environment.configure()
     for other in results[1:]:
         assert all(torch.equal(a, b) for a, b in zip(results[0], other))
+
+
+def test_a_thread_that_began_before_the_settings_flushes_denormals_once_it_trains():
+    """The mode belongs to a thread. One that kept denormals would round unlike its helpers."""
+    environment.ensure_configured()
+    found: list[float] = []
+
+    def work() -> None:
+        torch.set_flush_denormal(False)  # as in a thread of a pool that began earlier
+        environment.ensure_configured()
+        found.append(float(torch.tensor([1e-39]) * 0.5))
+
+    thread = threading.Thread(target=work)
+    thread.start()
+    thread.join()
+    assert found == [0.0]
 
 
 def test_apps_start_without_the_compiler_of_torch():
