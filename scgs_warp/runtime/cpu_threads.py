@@ -239,8 +239,9 @@ helpers = HelperThreads(False)
 
 
 def _forked() -> None:
-    """Start anew in a child process, which inherits no threads."""
+    """Start anew in a child process, which inherits no threads: torch's OpenMP would wait for those of the parent."""
     global helpers
+    torch.set_num_threads(1)
     helpers = HelperThreads(helpers.flush_denormals)
 
 

@@ -15,6 +15,7 @@ import tempfile
 import threading
 from collections.abc import Callable
 from contextlib import suppress
+from json import JSONDecodeError
 from typing import TypeVar
 
 import warp as wp
@@ -74,7 +75,7 @@ def prepared(kernel: wp.Kernel, prepare: Callable[[], Result]) -> Result:
             _use_private(f"{folder}: {error.strerror}")
             return prepare()
         except Exception as error:  # Warp raises nothing more specific
-            if not str(error).startswith(NOT_LOADED):
+            if not str(error).startswith(NOT_LOADED) and not isinstance(error, (JSONDecodeError, UnicodeDecodeError)):
                 raise
             raise UserError(
                 f"{folder}: the code of {kernel.key} is there but cannot be loaded; free memory (or raise ulimit -v), "

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import json
 import os
 import signal
 import subprocess
@@ -115,6 +116,31 @@ def test_sigterm_ends_a_process_that_uses_pycolmap():
     assert done.returncode == -signal.SIGTERM and done.stderr == b""
 
 
+FORKED = """
+import os, signal
+import torch
+from scgs_warp.runtime import cpu_threads, environment
+
+def work():
+    return float(torch.ones(1 << 20).exp().sum())
+
+environment.configure(2)
+expected = work()
+child = os.fork()
+if child == 0:
+    signal.alarm(20)
+    os._exit(0 if work() == expected else 1)
+print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
+"""
+
+
+@posix
+def test_a_forked_process_computes():
+    """As a worker of a ``ProcessPoolExecutor``. OpenMP would wait forever for the threads of the parent."""
+    done = subprocess.run([sys.executable, "-c", FORKED], env=ENVIRONMENT, timeout=300, capture_output=True, text=True)
+    assert (done.stdout, done.stderr) == ("0\n", "")
+
+
 def limit_addresses() -> None:
     import resource
 
@@ -210,6 +236,9 @@ def test_code_that_cannot_be_loaded_is_one_line(cache):
     assert "\n" not in str(caught.value)
     with pytest.raises(UserError, match="cannot be loaded; free memory"):
         kernel_cache.prepared(kernel, lambda: fail("Failed to load CPU module 'm' (no memory)", Exception))
+    for damaged in (b"{", b"\xff\xfe"):  # what describes the code, as a loss of power may leave it
+        with pytest.raises(UserError, match="remove the folder if its files are damaged"):
+            kernel_cache.prepared(kernel, lambda damaged=damaged: json.loads(damaged.decode()))
     with pytest.raises(RuntimeError, match="something else"):
         kernel_cache.prepared(kernel, lambda: fail("something else"))
 
