@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from scgs_warp.apps.arguments import one_line_errors, program
-from scgs_warp.apps.cli import Device, prepare, run
+from scgs_warp.apps.cli import Device, prepare, print_parts, run
 from scgs_warp.errors import UserError
 
 FIGURES = Path("docs/images")
@@ -128,7 +128,6 @@ def check(options: Common) -> None:
 
 def show(report: dict[str, Any]) -> None:
     """Print the rows as a table."""
-    from rich.console import Console
     from rich.table import Table
 
     machine = report["machine"]
@@ -152,16 +151,16 @@ def show(report: dict[str, Any]) -> None:
             f"{row['extra_mib']:,.0f}" if whole and row["extra_mib"] is not None else "",
             f"{row['two_thread_scaling']:.2f}" if whole else "",
         )
-    console = Console() if sys.stdout.isatty() else Console(width=120)
-    console.print(table)
     first = report["rows"][0]
-    console.print(
+    about = (
         f"{first['gaussians']:,} Gaussians, {first['control_points']:,} control points, {first['width']} x "
         f"{first['height']}, {first['pairs']:,} pairs of splat and tile, "
         f"{first['contributors']:.1f} splats a covered pixel; the first model holds {first['model_mib']:,.1f} MiB"
     )
+    notes = []
     if any(row["threads"] > 1 and row["two_thread_scaling"] < 1.8 for row in report["rows"] if row["device"] == "cpu"):
-        console.print("two threads were not twice as fast as one at plain arithmetic: take the one-thread rows")
+        notes = ["two threads were not twice as fast as one at plain arithmetic: take the one-thread rows"]
+    print_parts(table, about, *notes, width=None if sys.stdout.isatty() else 120)
 
 
 def show_motion(report: dict[str, Any]) -> None:

@@ -101,6 +101,21 @@ def run(main: Callable[[list[str] | None], None], args: list[str] | None = None)
     return 0
 
 
+def print_parts(*parts: object, width: int | None = None) -> None:
+    """Print tables and lines of rich, which itself would end the program with status 1 once the reader is gone.
+
+    Args:
+        width: number of columns; None: those of the terminal.
+    """
+    from rich.console import Console
+
+    console = Console(width=width)
+    with console.capture() as text:
+        for part in parts:
+            console.print(part)
+    print(text.get(), end="", flush=True)
+
+
 def prepare(device: Device, threads: int | None, memory_gib: float | None = None) -> str:
     """Configure threads, the flushing of denormals and the memory limit, then choose the device.
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, Literal
 import tyro
 
 from scgs_warp.apps.arguments import parse
-from scgs_warp.apps.cli import Device, prepare, run
+from scgs_warp.apps.cli import Device, prepare, print_parts, run
 
 if TYPE_CHECKING:
     from scgs_warp.data import Dataset
@@ -129,7 +129,6 @@ def pictures_folder(folder: Path, metrics: Path | None) -> Path | None:
 
 def show(metrics: dict[str, Any], unfinished: str | None) -> None:
     """Print the metrics as a table."""
-    from rich.console import Console
     from rich.table import Table
 
     where = unfinished or f"step {metrics['step']:,}"
@@ -164,7 +163,7 @@ def show(metrics: dict[str, Any], unfinished: str | None) -> None:
     }
     cells = [f"{metrics[key]:.{digits[key]}f}" if key in digits else f"{metrics[key]:,}" for key in present]
     table.add_row(*cells)
-    Console().print(table)
+    print_parts(table)
 
 
 def main(args: list[str] | None) -> None:

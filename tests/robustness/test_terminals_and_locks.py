@@ -24,6 +24,7 @@ from helpers.fault_runs import (
 )
 from helpers.paths import ROOT
 from helpers.tiny import tiny_config, tiny_dataset
+from scgs_warp.apps import cli
 from scgs_warp.config.presets import to_dict
 from scgs_warp.storage import checkpoint
 from scgs_warp.training.loop import fit
@@ -94,6 +95,16 @@ def test_closed_pipe_trains_on(done, tmp_path, monkeypatch):
         assert app.cli([*arguments, "--output", str(tmp_path / "run")]) == 0
         monkeypatch.undo()
     assert checkpoint_bytes(tmp_path / "run") == checkpoint_bytes(done[1]) and (tmp_path / "run/metrics.json").exists()
+
+
+def test_table_for_a_reader_that_is_gone(monkeypatch):
+    """rich alone would end the program with status 1."""
+    reader, writer = os.pipe()
+    os.close(reader)
+    with open(writer, "w") as stream:
+        monkeypatch.setattr(sys, "stdout", stream)
+        assert cli.run(lambda _: cli.print_parts("a table")) == 0
+        monkeypatch.undo()
 
 
 def test_no_standard_output(tmp_path, monkeypatch, whole):
