@@ -119,11 +119,14 @@ def read(
         UserError: there is no checkpoint, or its format is unknown.
     """
     path = folder / name
+    check_name(folder)
     spare = name == FILE and (folder / PREVIOUS).is_file()
     remedy = f"{PREVIOUS} is there: apps/train.py --resume falls back on it" if spare else "train again"
     if not path.is_file():
         if spare:
             raise DamagedCheckpoint(f"{path}: is missing; {remedy}")
+        if os.path.lexists(path):
+            raise UserError(f"{path}: is no file, or a link to one that is gone; restore it")
         raise UserError(f"{folder}: no {name} here; give with --run a folder that apps/train.py wrote")
     try:
         with safe_open(path, framework="pt") as file:
@@ -147,6 +150,19 @@ def read(
             f"{path}: format {str(metadata.get('format'))[:20]} is not {FORMAT}; use the version that wrote it"
         )
     return tensors, metadata
+
+
+def check_name(folder: Path) -> None:
+    """Check that checkpoints in a folder can be read: safetensors takes names in UTF-8 alone, which those of other
+    systems' files may not be.
+
+    Raises:
+        UserError: naming the folder.
+    """
+    try:
+        str(folder).encode()
+    except UnicodeEncodeError:
+        raise UserError(f"{folder}: is no name in UTF-8, so that checkpoints there cannot be read; rename it") from None
 
 
 def fall_back(folder: Path, error: DamagedCheckpoint) -> str:

@@ -15,7 +15,7 @@ from ..ops.shapes import shown
 from ..storage import checkpoint
 from ..storage.locks import AlreadyLocked, lock_file
 from .resuming import check_same_configuration, check_steps
-from .run_folder import LOCK, refuse_existing
+from .run_folder import LOCK, SETTINGS, refuse_existing
 
 CHOSEN_BY_THE_DATA = (
     "init_from",
@@ -59,7 +59,12 @@ def refuse_early(config: TrainConfig, output: Path, resume: bool) -> None:
     saved, step = metadata.get("config"), metadata.get("step")
     if isinstance(saved, dict):
         saved = with_newer_fields(saved, recorded=True)
-        check_same_configuration(saved, to_dict(config), source, besides=CHOSEN_BY_THE_DATA)
+        try:
+            check_same_configuration(saved, to_dict(config), source, besides=CHOSEN_BY_THE_DATA)
+        except UserError as error:
+            if (output / SETTINGS).is_file():
+                raise
+            raise UserError(f"{error}; {output / SETTINGS}, which holds them, is missing: restore it") from None
     if isinstance(step, int):
         check_steps(step, config, source)
 
@@ -70,6 +75,7 @@ def refuse_unwritable(output: Path) -> None:
     Raises:
         UserError: names the folder and the remedy.
     """
+    checkpoint.check_name(output.absolute())
     if os.path.lexists(output) and not output.is_dir():
         raise UserError(f"{output}: is no folder; choose another --output")
     folders = (output.absolute(), *output.absolute().parents)

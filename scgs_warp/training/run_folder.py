@@ -60,7 +60,7 @@ def refuse_existing(path: Path, resume: bool) -> None:
     """
     if resume:
         return
-    if (path / FILE).exists() or (path / PREVIOUS).exists():
+    if any(os.path.lexists(path / name) for name in (FILE, PREVIOUS)):
         raise UserError(f"{path}: holds a run already; continue it with --resume or choose another --output")
     begun = RESULTS if _has_settings(path / SETTINGS) else (SETTINGS, LOG, *RESULTS)
     for name in begun:
@@ -127,7 +127,8 @@ class RunFolder:
             (self.path / PREVIEWS).mkdir(parents=True, exist_ok=True)
             self._lock()
         except OSError as error:
-            raise UserError(f"{self.path}: cannot be written ({error.strerror}); choose another --output") from error
+            where = error.filename or self.path
+            raise UserError(f"{where}: cannot be written ({error.strerror}); choose another --output") from error
         try:
             refuse_existing(self.path, self.resume)
             if not self.resume:
@@ -171,7 +172,7 @@ class RunFolder:
 
         A trainer that ends before its configuration is written, as on a full disk, leaves only what it makes first.
         """
-        if any((self.path / name).exists() for name in (FILE, PREVIOUS)):
+        if any(os.path.lexists(self.path / name) for name in (FILE, PREVIOUS)):
             return False
         if _has_settings(self.path / SETTINGS):
             return True

@@ -31,6 +31,7 @@ from scgs_warp.errors import UserError
 from scgs_warp.scene.scene import Scene
 from scgs_warp.storage import checkpoint
 from scgs_warp.training.loop import fit
+from scgs_warp.training.preflight import refuse_early
 
 at_step, done, images, whole = fault_runs.at_step, fault_runs.done, fault_runs.images, fault_runs.whole
 
@@ -83,6 +84,44 @@ def test_damaged_checkpoint_falls_back_on_the_previous_one(how, tmp_path, at_ste
     (said,) = warnings(capsys.readouterr().out)
     assert f"step {FAULT_STEP - 1}" in said and checkpoint.PREVIOUS in said
     assert (run / checkpoint.DAMAGED).exists() == (how != "all of it")
+
+
+def test_checkpoint_that_links_to_a_disk_that_is_away_is_not_trained_anew(tmp_path):
+    fit(config(), tiny_dataset(FRAMES), output=tmp_path / "run")
+    link = tmp_path / "run" / checkpoint.FILE
+    link.unlink()
+    link.symlink_to(tmp_path / "away")
+    with pytest.raises(UserError, match=r"checkpoint.safetensors: is no file, or a link to one that is gone"):
+        resume(tmp_path / "run")
+    with pytest.raises(UserError, match="holds a run already"):
+        fit(config(), tiny_dataset(FRAMES), output=tmp_path / "run")
+    assert link.is_symlink()
+
+
+def test_lost_settings_are_named_where_a_run_is_resumed_without_them(tmp_path):
+    fit(config(), tiny_dataset(FRAMES), output=tmp_path)
+    refuse_early(config(), tmp_path, True)
+    with pytest.raises(UserError, match=r"made with seed = 0, now 1; [^;]*$"):
+        refuse_early(config(seed=1), tmp_path, True)
+    (tmp_path / "config.json").unlink()
+    refuse_early(config(), tmp_path, True)
+    with pytest.raises(UserError, match=r"made with seed = 0, now 1;.*config.json, which holds them, is missing"):
+        refuse_early(config(seed=1), tmp_path, True)
+
+
+def test_file_in_the_place_of_a_folder_is_named(tmp_path):
+    (tmp_path / "previews").write_bytes(b"")
+    assert "previews: cannot be written (File exists)" in refusal(tmp_path, config())
+
+
+@pytest.mark.skipif(os.name != "posix", reason="names are bytes on POSIX systems")
+def test_name_that_is_no_utf8_is_refused_before_training(tmp_path):
+    """As of a folder from a system with Latin-1. A checkpoint there could be written but not read."""
+    folder = tmp_path / os.fsdecode(b"Caf\xe9")
+    with pytest.raises(UserError, match="is no name in UTF-8"):
+        refuse_early(config(), folder, False)
+    with pytest.raises(UserError, match="is no name in UTF-8"):
+        checkpoint.read(folder)
 
 
 def test_two_damaged_checkpoints_are_refused(tmp_path):
