@@ -24,8 +24,9 @@ class Options:
     video: tyro.conf.Positional[Path | None] = None
     """Video, or folder of images from one camera."""
     rig: Path | None = None
-    """Instead of VIDEO, folder with one video per camera of a rig: cameras that stand still. They are synchronised by
-    their sound. Beside a poses_bounds.npy (Neural 3D Video), the videos are unpacked and the cameras kept."""
+    """Instead of VIDEO, folder with one video (or one folder with a video) per camera of a rig: cameras that stand
+    still. They are synchronised by their sound. Beside a poses_bounds.npy (Neural 3D Video), the videos are unpacked
+    and the cameras kept."""
     poses: Path | None = None
     """Instead of VIDEO, what another program has found: an .npz of MegaSaM, VGGT, MapAnything, Depth Anything 3,
     SpatialTrackerV2 or Pi3, or a folder of MonST3R, ViPE, CUT3R, DA3-Streaming, Polycam, Record3D, 3D Scanner App or

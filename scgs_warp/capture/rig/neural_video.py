@@ -37,7 +37,7 @@ class KnownCameras(NamedTuple):
         return made
 
 
-def known_cameras(folder: Path, files: list[Path]) -> KnownCameras | None:
+def known_cameras(folder: Path, names: list[str]) -> KnownCameras | None:
     """Read ``poses_bounds.npy`` of the folder; return None without this file.
 
     Raises:
@@ -47,10 +47,10 @@ def known_cameras(folder: Path, files: list[Path]) -> KnownCameras | None:
     if not path.is_file():
         return None
     rows = read_rows(path)
-    if len(rows) != len(files):
+    if len(rows) != len(names):
         raise UserError(
-            f"{path}: has {len(rows)} rows, but {folder} holds {len(files)} videos ({files[0].name} to "
-            f"{files[-1].name}); give each camera a row and a video"
+            f"{path}: has {len(rows)} rows, but {folder} holds {len(names)} videos ({names[0]} to "
+            f"{names[-1]}); give each camera a row and a video"
         )
     return KnownCameras(path, rows)
 

@@ -63,12 +63,11 @@ def capture_rig(request: RigRequest, folder: Path, *, device: str = "cpu", show:
     Raises:
         UserError: a video or an option is invalid, or too few cameras were found.
     """
-    files = videos_of(request.folder)
-    names = [file.stem for file in files]
-    check(request, names)
-    known = known_cameras(request.folder, files)
+    videos = videos_of(request.folder)
+    check(request, list(videos))
+    known = known_cameras(request.folder, list(videos))
     with disk_errors(folder):
-        rig = _Rig(request, folder, files, FILE if known is None else POSES, device, show)
+        rig = _Rig(request, folder, videos, FILE if known is None else POSES, device, show)
         with rig.journal.started():
             return _capture(rig, known)
 
@@ -111,20 +110,21 @@ class _Rig:
     """A rig in work."""
 
     def __init__(
-        self, request: RigRequest, folder: Path, files: list[Path], marker: str, device: str, show: ShowProgress
+        self, request: RigRequest, folder: Path, videos: dict[str, Path], marker: str, device: str, show: ShowProgress
     ) -> None:
         """
         Args:
+            videos: by the names of the cameras.
             marker: file whose presence marks a finished folder.
         """
-        self.request, self.folder, self.files = request, folder, files
-        self.names = [file.stem for file in files]
+        self.request, self.folder = request, folder
+        self.names, self.files = list(videos), list(videos.values())
         self.device, self.show = device, show
-        self.videos = [Video(file) for file in files]
+        self.videos = [Video(file) for file in self.files]
         self.journal = Journal(folder, self._digest, marker)
         self.work = self.journal.work
         self.recorded: list[Recorded] = []
-        self.size = CommonSize(request.size, [0] * len(files), None)
+        self.size = CommonSize(request.size, [0] * len(videos), None)
         self.exposures: list[str] = []
         """Note on cameras that are darker or brighter than most."""
 
@@ -149,14 +149,15 @@ class _Rig:
             for file in self.files:
                 sounds.append(read_sound(file))
                 bar.advance()
-        silent = [file.name for file, sound in zip(self.files, sounds) if sound is None]
+        shown = [str(file.relative_to(self.request.folder)) for file in self.files]
+        silent = [file for file, sound in zip(shown, sounds) if sound is None]
         if silent:
             raise UserError(
                 f"{', '.join(silent)}: no sound to synchronise by; give --offsets, the second at which each video "
                 "begins, or --offsets 0 if all begin at once"
             )
         clock = synchronisation.synchronise(sounds)
-        lost = [file.name for file, start in zip(self.files, clock.starts) if not np.isfinite(start)]
+        lost = [file for file, start in zip(shown, clock.starts) if not np.isfinite(start)]
         if lost:
             raise UserError(
                 f"{', '.join(lost)}: its sound matches that of no other camera; give --offsets, or take it out"

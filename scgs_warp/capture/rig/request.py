@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from ...data.natural_order import natural
 from ...data.unknown import FILMS
 from ...errors import UserError
 from ..features import CameraModel
@@ -22,7 +21,7 @@ class RigRequest:
     """Settings of a rig's capture."""
 
     folder: Path
-    """Folder with one video per camera."""
+    """Folder with one video per camera, or with one folder per camera that holds its video."""
     frames: int | None = None
     """Number of instants; None: at most ``instants.RIG_INSTANTS``."""
     start: float | None = None
@@ -46,32 +45,60 @@ class RigRequest:
     seed: int = 0
 
 
-def videos_of(folder: Path) -> list[Path]:
-    """Return the videos of a rig, in the natural order of their names.
+def videos_of(folder: Path) -> dict[str, Path]:
+    """Return the videos of a rig by the names of their cameras, in the natural order of these: the files in the folder,
+    or the only file in each of its folders, whose name is then that of the camera.
 
     Raises:
-        UserError: there are too few.
+        UserError: there are too few, or a camera has several.
     """
     if not folder.is_dir():
         raise UserError(f"--rig {folder}: no such folder; give the folder that holds one video per camera")
-    found = [path for path in folder.iterdir() if path.suffix.lower() in FILMS and path.is_file()]
-    files = sorted((path for path in found if not path.name.startswith(".")), key=lambda path: natural(path.name))
+    files = files_in(folder, FILMS)
+    inner = {path.name: files_in(path, FILMS) for path in folders_in(folder)} if len(files) < FEWEST_CAMERAS else {}
+    inner = {name: own for name, own in inner.items() if own}
+    if len(inner) >= FEWEST_CAMERAS:
+        return _only_ones(folder, inner, files)
     if len(files) < FEWEST_CAMERAS:
-        of_images = [inner.name for inner in folders_in(folder) if files_in(inner, read_suffixes())]
-        if len(of_images) >= FEWEST_CAMERAS:
-            raise UserError(
-                f"--rig {folder}: holds folders of images ({of_images[0]} to {of_images[-1]}); make a video of each, "
-                "all with one frame rate, and give --offsets 0 if they began at once"
-            )
-        raise UserError(
-            f"--rig {folder}: holds {len(files)} videos ({', '.join(FILMS)}); give one video per camera, at "
-            f"least {FEWEST_CAMERAS}"
-        )
+        raise UserError(f"--rig {folder}: {_too_few(folder, files, inner)}")
     stems = [path.stem for path in files]
     twice = next((name for name in stems if stems.count(name) > 1), None)
     if twice is not None:
         raise UserError(f"--rig {folder}: two videos are called {twice}; give each camera its own name")
-    return files
+    return dict(zip(stems, files))
+
+
+def _only_ones(folder: Path, inner: dict[str, list[Path]], beside: list[Path]) -> dict[str, Path]:
+    """Return the only video of each camera's folder."""
+    if beside:
+        raise UserError(
+            f"--rig {folder}: holds {beside[0].name} beside folders of videos ({', '.join(inner)}); give it a folder "
+            "of its own if it is that of a camera, or take it out"
+        )
+    several = next((name for name, own in inner.items() if len(own) > 1), None)
+    if several is not None:
+        raise UserError(
+            f"--rig {folder}: the folder {several} holds {len(inner[several])} videos ({inner[several][0].name}, "
+            f"{inner[several][1].name}); leave one in the folder of each camera: join the parts of a recording"
+        )
+    return {name: own[0] for name, own in inner.items()}
+
+
+def _too_few(folder: Path, files: list[Path], inner: dict[str, list[Path]]) -> str:
+    """Say what is in a folder instead of the videos of a rig, and what to do."""
+    of_images = [path.name for path in folders_in(folder) if files_in(path, read_suffixes())]
+    if not inner and len(of_images) >= FEWEST_CAMERAS:
+        return (
+            f"holds folders of images ({of_images[0]} to {of_images[-1]}); make a video of each, all with one frame "
+            "rate, and give --offsets 0 if they began at once"
+        )
+    below = next((name for name, own in inner.items() if len(own) >= FEWEST_CAMERAS), None)
+    if below is not None:
+        return f"holds {len(files)} videos, but {below} does; give --rig {folder / below}"
+    return (
+        f"holds {len(files) + len(inner)} videos ({', '.join(FILMS)}); give one video per camera, or one folder per "
+        f"camera with its video, for at least {FEWEST_CAMERAS} cameras"
+    )
 
 
 def check(request: RigRequest, names: list[str]) -> None:

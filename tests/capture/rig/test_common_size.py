@@ -112,7 +112,7 @@ def test_films_of_camcorders_and_old_phones_are_films(tmp_path):
     names = {"00001.MTS", "b.3gp", "c.mp4", "d.MXF", "e.ts", "f.dv", "MOV001.MOD"}
     for name in (*names, "d.txt"):
         (tmp_path / name).write_bytes(b"x")
-    assert {file.name for file in videos_of(tmp_path)} == names
+    assert {file.name for file in videos_of(tmp_path).values()} == names
     for name in names - {"00001.MTS"}:
         (tmp_path / name).unlink()
     with pytest.raises(UserError, match="holds 1 videos"):
