@@ -11,6 +11,11 @@ import numpy as np
 from . import cut_out
 from .high_dynamic_range import is_high_dynamic_range, to_standard
 
+BT709, UNKNOWN, BT2020 = 1, 2, 9
+"""Numbers of the matrices from RGB to the stored brightness and colour differences (ITU-T H.273)."""
+HD_LONGER, SD_SHORTER = 1280, 576
+"""Sides, pixels, from which on and beyond which films are of high definition."""
+
 
 def picture(frame: Any, longest: int, shape: float) -> tuple[np.ndarray, np.ndarray | None]:
     """Return [H, W, 3] uint8 and alpha [H, W] uint8, None for a film without alpha.
@@ -22,6 +27,8 @@ def picture(frame: Any, longest: int, shape: float) -> tuple[np.ndarray, np.ndar
     width, height = frame.width * shape, frame.height
     scale = min(1.0, longest / max(width, height))
     rich = is_high_dynamic_range(frame.color_trc)
+    if frame.colorspace == UNKNOWN:
+        frame.colorspace = _usual_matrix(frame.width, frame.height, rich)
     clear = not rich and any(component.is_alpha for component in frame.format.components)
     image = frame.to_ndarray(format="rgb48le" if rich else "rgba" if clear else "rgb24")
     if frame.interlaced_frame:
@@ -34,6 +41,14 @@ def picture(frame: Any, longest: int, shape: float) -> tuple[np.ndarray, np.ndar
         image = to_standard(image, frame.color_trc)
     matrix = _display_matrix(frame)
     return turned(image, matrix), None if alpha is None else turned(alpha, matrix)
+
+
+def _usual_matrix(width: int, height: int, rich: bool) -> int:
+    """Return the matrix that players take for a film that does not name its own: by convention, BT.709 is that of high
+    definition, BT.2020 that of high dynamic range, and BT.601, which is ffmpeg's own choice, that of the rest."""
+    if rich:
+        return BT2020
+    return BT709 if max(width, height) >= HD_LONGER or min(width, height) > SD_SHORTER else UNKNOWN
 
 
 def _one_field(image: np.ndarray) -> np.ndarray:

@@ -24,6 +24,7 @@ def write_film(path: Path, pictures: Sequence[np.ndarray], fps: float, crf: int,
         OSError: the file cannot be written.
     """
     import av
+    from av.video.reformatter import ColorRange, Colorspace
 
     height, width = pictures[0].shape[:2]
     with av.open(for_ffmpeg(path), "w", format="mp4") as container:
@@ -31,6 +32,8 @@ def write_film(path: Path, pictures: Sequence[np.ndarray], fps: float, crf: int,
         options = {"crf": str(crf), "preset": "medium", "x264-params": "mbtree=0:threads=1"}
         video: Any = container.add_stream("libx264", rate=Fraction(fps).limit_denominator(1000), options=options)
         video.width, video.height, video.pix_fmt = width, height, "yuv420p"
+        # ffmpeg converts by this matrix unless told otherwise; without the tag, players take another for large films.
+        video.codec_context.colorspace, video.codec_context.color_range = Colorspace.ITU601, ColorRange.MPEG
         audio: Any = None if sound is None else container.add_stream("aac", rate=SAMPLE_RATE, layout="mono")
         for picture in pictures:
             container.mux(video.encode(av.VideoFrame.from_ndarray(picture, format="rgb24")))
