@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import struct
 from collections.abc import Container, Iterator
 from pathlib import Path
@@ -44,7 +45,9 @@ class Animation:
             UserError: the file does not decode.
         """
         self.path = path
-        self.count = sum(1 for _ in self._moments())
+        moments = [seconds for _, seconds in self._moments()]
+        self.count = len(moments)
+        self.rate = (self.count - 1) / moments[-1] if moments[-1] > 0 else math.inf
 
     def _moments(self) -> Iterator[tuple[np.ndarray, float]]:
         """Yield the pictures [H, W, 4] and their times in seconds."""

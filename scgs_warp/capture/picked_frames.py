@@ -145,7 +145,7 @@ def frames_of(stored: Any) -> PickedFrames | None:
 def choose(request: CaptureRequest, source: Source, show: ShowProgress) -> PickedFrames:
     """Choose the frames to use; for a folder, all of them unless a number is given."""
     start, end = request.start or 0.0, math.inf if request.end is None else request.end
-    with show(source.count, "looking at frames") as bar:
+    with show(int(min(source.count, 1 + end * source.rate)), "looking at frames") as bar:
         within = (
             still
             for still in takewhile(lambda still: still.seconds <= end or not source.video, _shown(source, bar))

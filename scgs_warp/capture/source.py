@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from array import array
 from collections import Counter
 from collections.abc import Container, Iterator
@@ -46,6 +47,8 @@ class Source(Protocol):
     """True for a video, whose frames are consecutive; images of a folder need not be."""
     count: int
     """Number of frames according to the file's header, which may be wrong."""
+    rate: float
+    """Frames per second according to the header; infinite for a folder, whose images are all at hand."""
     incomplete: Incomplete | None
     """What is there of an incomplete film, once all frames have been read."""
 
@@ -235,6 +238,7 @@ class Folder:
     """A folder of images, in the natural order of their names."""
 
     video = False
+    rate = math.inf
     incomplete: Incomplete | None = None
 
     def __init__(self, path: Path) -> None:
