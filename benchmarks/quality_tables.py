@@ -357,6 +357,7 @@ WRITERS: dict[str, Callable[[Source], str]] = {
     "sharpness": change_of_defaults,
     "fast-parts": change_of_defaults,
     "halved": change_of_defaults,
+    "halved-longer": change_of_defaults,
     "faint": change_of_defaults,
     "background": backgrounds,
     "levers": levers,

@@ -59,7 +59,7 @@ def preset(name: PresetName) -> TrainConfig:
         steps=24_000,
         freeze=400,
         coarse=1_800,
-        half_size=6_000,
+        half_size=9_000,
         init_points=10_000,
         evaluate_every=5_000,
         pretrain=PretrainConfig(steps=3_000, densify_until=2_000, warm_up=100, progressive_every=300),
