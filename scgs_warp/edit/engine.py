@@ -109,6 +109,11 @@ class Engine:
         self._under: tuple[float, NodePose, Gaussians] | None = None
         """Gaussians under an edit's holds and exaggeration alone, which stay while parts are dragged."""
 
+    @property
+    def masked(self) -> bool:
+        """Whether Gaussians take part in the motion by a learnt share; handles move all of them whole."""
+        return bool(self.scene.config.motion.mask) and self.rig.moves
+
     def drawn_with(self, scene: Scene) -> Engine:
         """Return an engine that bends as this one and poses the Gaussians of another scene, whose places, neighbours
         and motion are those of this one's. The two share caches."""
@@ -217,7 +222,7 @@ class Engine:
         return self._posed(time, bent)
 
     def _posed(self, time: float, bent: NodePose) -> Gaussians:
-        masked = bool(self.scene.config.motion.mask) and self.rig.moves
+        masked = self.masked
         model = self.rig, self.scene.gaussians, self.motion_at(time)
         if bent.base is None or bent.skin is None:
             self._under = None

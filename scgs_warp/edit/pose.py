@@ -69,6 +69,12 @@ class NodePose:
         color_turns = turns if color_turns is None else color_turns
         return NodePose(positions, _further(turns, self.turns), _further(color_turns, self.color_turns))
 
+    def turns_since(self, base: NodePose) -> np.ndarray:
+        """Return the turns [M, 4] from another pose to this one."""
+        further = multiply(self.turns, conjugate(base.turns))
+        further[(self.turns == base.turns).all(1)] = IDENTITY
+        return further
+
 
 def _further(second: np.ndarray, first: np.ndarray) -> np.ndarray:
     return np.where(second[:, 1:].any(1, keepdims=True), multiply(second, first), first)
@@ -164,9 +170,7 @@ def _share_of(turns: Tensor, gaussians: GaussianParameters) -> Tensor:
 
 def _with_parts(posed: Gaussians, bent: NodePose, base: NodePose, skin: PartSkin) -> Gaussians:
     """Move posed Gaussians with their parts from ``base`` to ``bent``."""
-    further = multiply(bent.turns, conjugate(base.turns))
-    further[(bent.turns == base.turns).all(1)] = IDENTITY
-    found = skin.moved(posed, base.positions, bent.positions, further)
+    found = skin.moved(posed, base.positions, bent.positions, bent.turns_since(base))
     sh_rest = posed.sh_rest
     if sh_rest.shape[1]:
         sh_rest = rotate_harmonics(sh_rest, found.blends)
@@ -179,13 +183,11 @@ def _on_top(
     """Move posed Gaussians with their control points from ``base`` to ``bent``. Gaussians whose control points have not
     moved stay bit-identical."""
     device = posed.means.device
-    further = multiply(bent.turns, conjugate(base.turns))
-    still = (bent.turns == base.turns).all(1)
-    further[still] = IDENTITY
+    further = bent.turns_since(base)
     shift = bent.positions - base.positions
     nodes, shifts, turns = (torch.from_numpy(x).float().to(device) for x in (base.positions, shift, further))
     means, quats, _ = skin(posed.means, posed.quats, nodes, Pose(shifts, turns), *binding)
-    moved = torch.from_numpy(shift.any(1) | ~still).to(device)
+    moved = torch.from_numpy(shift.any(1) | (bent.turns != base.turns).any(1)).to(device)
     touched = moved[binding[0].long()].any(dim=1, keepdim=True)
     sh_rest = posed.sh_rest
     if sh_rest.shape[1]:

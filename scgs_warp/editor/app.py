@@ -19,7 +19,7 @@ from ..errors import UserError, one_line
 from ..export.page import MAX_DEGREE
 from ..export.page_data import pack
 from ..export.page_edit import own_motion
-from ..export.page_pose import with_parts
+from ..export.page_pose import posable
 from ..export.page_scene import page_scene
 from ..live.server import Client, PageServer
 from ..live.viewer import digest
@@ -358,7 +358,7 @@ class Editor:
 
     def _pack(self) -> bytes:
         scene = self.session.scene
-        motion = with_parts(self.session, own_motion(self.session))
+        motion = posable(self.session, own_motion(self.session))
         content = page_scene(scene, min(scene.gaussians.sh_degree, MAX_DEGREE), motion_of=motion)
         return pack(content.facts, content.columns)
 

@@ -12,8 +12,8 @@ from ..edit.rotations import rotate, to_matrix, unit
 from ..export.page_edit import edited_pose
 from .model import Moment
 
-WIDTH = 28
-"""Numbers of a control point's pose; ``web/data.js`` names them."""
+WIDTH, LAYERED_WIDTH = 28, 44
+"""Numbers of a control point's pose, without and with a motion mask; ``web/data.js`` names them."""
 HEADER = struct.Struct("<4i")
 """Kind of the message, version of the edit, frame of the film (-1: the moment of a drag), reserved."""
 POSE, PICTURE = 1, 2
@@ -21,8 +21,8 @@ POSE, PICTURE = 1, 2
 
 
 def pose_table(session: EditSession, moment: Moment) -> np.ndarray:
-    """Return the poses of all control points at a moment, [M, 28] float32, normalised units. Call it on the worker's
-    thread."""
+    """Return the poses of all control points at a moment, [M, 28 or 44] float32, normalised units. Call it on the
+    worker's thread."""
     pose = edited_pose(session, min(max(moment.time, 0.0), 1.0), moment.at, live=moment.live)
     return _table(pose, session.engine.rig.positions.detach().cpu().double().numpy())
 
@@ -30,17 +30,27 @@ def pose_table(session: EditSession, moment: Moment) -> np.ndarray:
 def _table(pose: Mapping[str, np.ndarray], rest: np.ndarray) -> np.ndarray:
     """Put the poses of control points at ``rest`` [M, 3] into one table."""
     rotation = unit(pose["rotation"])
-    table = np.zeros((len(rest), WIDTH))
-    rows = table[:, :12].reshape(-1, 3, 4)
-    rows[:, :, :3] = to_matrix(rotation)
-    rows[:, :, 3] = rest + pose["translation"] - rotate(rotation, rest)
+    layered = "further" in pose
+    table = np.zeros((len(rest), LAYERED_WIDTH if layered else WIDTH))
+    table[:, :12] = _maps(rotation, rest, pose["translation"])
     table[:, 12:16] = unit(pose.get("shape", rotation))
     extra = pose.get("log_scale", pose.get("tint"))
     if extra is not None:
         table[:, 16:19] = extra
     table[:, 20:24] = unit(pose["own"])
     table[:, 24:28] = unit(pose["turn"])
+    if layered:
+        table[:, 40:44] = further = unit(pose["further"])
+        table[:, 28:40] = _maps(further, rest + pose["translation"], pose["shift"])
     return table.astype(np.float32)
+
+
+def _maps(rotation: np.ndarray, points: np.ndarray, shifts: np.ndarray) -> np.ndarray:
+    """Return maps [M, 12], by rows, that turn by ``rotation`` [M, 4] about ``points`` [M, 3], then shift."""
+    rows = np.zeros((len(points), 3, 4))
+    rows[:, :, :3] = to_matrix(rotation)
+    rows[:, :, 3] = points + shifts - rotate(rotation, points)
+    return rows.reshape(-1, 12)
 
 
 def pose_message(table: np.ndarray, version: int, frame: int) -> bytes:

@@ -39,14 +39,9 @@ def edited_motion(
         compute: calls the function that computes a pose and returns its result, so that another thread may compute.
 
     Raises:
-        UserError: the motion is not finite, or the scene's motion has a mask.
+        UserError: the motion is not finite.
     """
     engine, edit = session.engine, session.edit
-    if bool(session.scene.config.motion.mask) and engine.rig.moves:
-        raise UserError(
-            "this scene's motion has a mask (motion.mask), so no page can play an edit of it; write a film, or from "
-            "the command line a ply-sequence"
-        )
     moments = film_times(session)
     times = [session.scene_time(at) for at in moments]
     tracks: dict[str, list[np.ndarray]] = {}
@@ -90,23 +85,32 @@ def film_times(session: EditSession) -> list[float]:
 
 def edited_pose(session: EditSession, time: float, at: float | None, *, live: bool = False) -> dict[str, np.ndarray]:
     """Return the poses of all control points at one instant, normalised units: ``translation`` [M, 3], ``rotation``,
-    ``own`` and ``turn`` [M, 4], and ``shape``, ``log_scale`` or ``tint`` if the motion has them."""
+    ``own`` and ``turn`` [M, 4], and ``shape``, ``log_scale`` or ``tint`` if the motion has them.
+
+    With a motion mask, these are poses under holds and exaggeration alone, which a Gaussian follows by its share, and
+    what handles do from there on follows: ``shift`` [M, 3] and ``further`` [M, 4].
+    """
     engine = session.engine
     motion = engine.motion_at(time)
     if live and at is None:
         bent = engine.bend_live(session.edit, time, frame=session.edit.reach)
     else:
         bent = engine.bend(session.edit, time, at, frame=session.edit.reach)
-    pose: Pose = motion.pose if bent is None else compose(motion, bent)
-    own = None if bent is None else own_pose(motion, bent)
+    base = bent.base if bent is not None and engine.masked and bent.base is not None else bent
+    pose: Pose = motion.pose if base is None else compose(motion, base)
+    own = None if base is None else own_pose(motion, base)
     still = np.zeros((len(motion.positions), 4))
     still[:, 0] = 1.0
     found = {
         "translation": to_array(pose.translations),
         "rotation": to_array(pose.rotations),
         "own": to_array((pose if own is None else own).turns_of_shapes),
-        "turn": still if bent is None else bent.color_turns,
+        "turn": still if base is None else base.color_turns,
     }
+    if engine.masked:
+        found["further"], found["shift"] = still, np.zeros((len(still), 3))
+        if bent is not None and base is not None:
+            found["further"], found["shift"] = bent.turns_since(base), bent.positions - base.positions
     others = {"shape": pose.shape_rotations, "log_scale": pose.log_scales, "tint": pose.tints}
     return {**found, **{name: to_array(value) for name, value in others.items() if value is not None}}
 

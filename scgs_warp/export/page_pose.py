@@ -7,27 +7,13 @@ import dataclasses
 import numpy as np
 
 from ..edit import EditSession
-from ..errors import UserError
 from .page_data import Column, integers, quantise
 from .page_parts import part_facts
 from .page_scene import STEPS, PageMotion
 
 
 def posable(session: EditSession, motion: PageMotion) -> PageMotion:
-    """Add the parts of the session's skeleton to a page's motion, for visitors to pull.
-
-    Raises:
-        UserError: the scene's motion has a mask.
-    """
-    if bool(session.scene.config.motion.mask) and session.engine.rig.moves:
-        raise UserError(
-            "--pose: this scene's motion has a mask (motion.mask), which a page cannot pose; leave --pose out"
-        )
-    return with_parts(session, motion)
-
-
-def with_parts(session: EditSession, motion: PageMotion) -> PageMotion:
-    """Add the parts of the session's skeleton to a page's motion."""
+    """Add the parts of the session's skeleton to a page's motion, for visitors to pull."""
     engine = session.engine
     poser = engine.poser(session.skeleton)
     skeleton, rows = poser.skeleton, poser.rows

@@ -29,7 +29,7 @@ COARSE_ERROR = 8e-4
 number of times is doubled until the error is below this, and then once more, which leaves about a quarter of the
 error."""
 POSE_PARTS = ("translation", "rotation", "shape", "log_scale", "tint")
-QUATERNIONS = ("rotation", "shape", "own", "turn")
+QUATERNIONS = ("rotation", "shape", "own", "turn", "further")
 TIMES_AT_ONCE = 16
 """Number of times per evaluation of the network; it limits the memory for many control points."""
 STEPS = {
@@ -78,7 +78,8 @@ class PageMotion:
     """Control points and weights of each Gaussian, [N, K] each."""
     poses: dict[str, np.ndarray]
     """As from :func:`sample_poses`; under an edit also ``own`` and ``turn`` [T, M, 4]: the rotations that shading and
-    correctives follow, and those that turn colours."""
+    correctives follow, and those that turn colours. With a motion mask, ``shift`` [T, M, 3] and ``further`` [T, M, 4]
+    are the edit's handles, which no share weakens."""
     facts: dict[str, Any] = field(default_factory=dict)
     """Further facts, which replace those of the scene."""
     columns: list[Column] = field(default_factory=list)

@@ -94,7 +94,7 @@ def build_skeleton(
     count, length = len(engine.rig.positions), len(moments)
     what = f"the motion of {count:,} control points at {length:,} instants"
     memory.require(JOINT_BYTES * count * length, "cpu", what, "give fewer --frames, or a shorter film")
-    masked = bound and bool(scene.config.motion.mask) and engine.rig.moves
+    masked = bound and engine.masked
     poses, own = [], []
     for moment in moments:
         pose, motion = _pose(session, moment, masked)
@@ -153,7 +153,7 @@ def _pose(session: EditSession, moment: AnimationMoment, masked: bool) -> tuple[
     if masked:
         raise UserError(
             "--edit: with this run's mask (motion.mask), Gaussians follow handles whole but the motion by a share, "
-            "which control points cannot hold; write a film, ply-sequence, 4dgs, tracks or graph"
+            "which control points cannot hold; write a film, html, ply-sequence, 4dgs, tracks or graph"
         )
     return compose(motion, bent), own_pose(motion, bent)
 

@@ -8,13 +8,15 @@ from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
 from helpers.chromium import chromium
 from helpers.edit_scenes import bar_scene
 from helpers.page_visits import Visit, psnr
-from scgs_warp.edit import EditSession
+from scgs_warp.edit import Edit, EditSession, Exaggerate, Hold
 from scgs_warp.edit.filming import film_camera
-from scgs_warp.errors import UserError
+from scgs_warp.editor.model import Moment
+from scgs_warp.editor.poses import pose_table
 from scgs_warp.export.page import write_page
 from scgs_warp.export.page_edit import edited_motion, film_times, own_motion
 from scgs_warp.export.page_pose import posable
@@ -107,9 +109,45 @@ def test_captions_are_shown_in_their_time(browser, tmp_path):
     visit.context.close()
 
 
-def test_masks_are_refused():
-    session = EditSession(bar_scene(share=0.5))
-    with pytest.raises(UserError, match=r"motion\.mask"):
-        edited_motion(session)
-    with pytest.raises(UserError, match=r"motion\.mask"):
-        posable(session, own_motion(session))
+def masked_session() -> EditSession:
+    """A session whose Gaussians take part in the motion by different shares, with a hold and handles at both ends."""
+    session = bent_session(shaded=True, corrected=True, share=0.5)
+    with torch.no_grad():
+        session.scene.gaussians.hyper[:, -1] = torch.linspace(-3.0, 3.0, len(session.scene.gaussians))
+    x = session.node_positions(0.0)[:, 0]
+    hold = Hold(tuple(np.flatnonzero(x > np.quantile(x, 0.7)).tolist()), 0.2)
+    session.apply(dataclasses.replace(session.edit, holds=(hold,), exaggerate=Exaggerate(1.3)))
+    return session
+
+
+def test_frames_of_an_edit_with_a_mask_are_those_of_the_session(browser, tmp_path):
+    """The mask weakens hold and exaggeration, but not the handle."""
+    session = masked_session()
+    write_page(session.scene, tmp_path / "page.html", motion=edited_motion(session))
+    visit = Visit(browser, tmp_path / "page.html")
+    for at in (0.0, 0.55, 0.95, 1.9):
+        camera = film_camera(session, at, 120)
+        ours = session.render(camera, session.scene_time(at), at, (0, 0, 0)).rgb.clamp(0, 1).numpy()
+        assert psnr(visit.render(camera, at / 2.0), ours) > 45, at
+    at = 1.0
+    table = pose_table(session, Moment(session.scene_time(at), at, False))
+    read = visit.ask("Array.from(player.pose(0.5, new Float32Array(player.table.length), true))")
+    assert np.abs(np.reshape(read, table.shape) - table).max() < 2e-3, "the editor's page draws the same"
+    assert visit.problems == []
+    visit.context.close()
+
+
+def test_parts_of_a_scene_with_a_mask_are_pulled_whole(browser, tmp_path):
+    session = masked_session()
+    session.apply(Edit(skin="nodes"))
+    write_page(session.scene, tmp_path / "page.html", motion=posable(session, own_motion(session)))
+    visit, time = Visit(browser, tmp_path / "page.html"), 0.7
+    part = next(part for part in session.parts() if part.parent is not None)
+    session.turn(part.name, 50.0, (0.0, 1.0, 0.0))
+    turn = session.edit.targets[session.edit.handles[0].name].rotation
+    visit.ask("(player.figure.turns[argument[0]] = argument[1])", [session.parts().index(part), list(turn)])
+    camera = film_camera(session, 0.0, 120)
+    ours = session.render(camera, time, background=(0, 0, 0)).rgb.clamp(0, 1).numpy()
+    plain = session.scene.render(camera, time, (0, 0, 0)).rgb.clamp(0, 1).numpy()
+    assert psnr(visit.render(camera, time), ours) > 45 and psnr(plain, ours) < 35
+    visit.context.close()

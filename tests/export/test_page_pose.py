@@ -16,7 +16,7 @@ from helpers.touch import Touch
 from scgs_warp.edit import EditSession
 from scgs_warp.export.page import write_page
 from scgs_warp.export.page_edit import own_motion
-from scgs_warp.export.page_pose import with_parts
+from scgs_warp.export.page_pose import posable
 from scgs_warp.geometry.cameras import orbit_camera
 
 
@@ -30,7 +30,7 @@ def browser() -> Iterator[Any]:
 def figure(tmp_path_factory) -> tuple[EditSession, Path]:
     session = EditSession(figure_scene(nodes=200, points=5000)[0])
     path = tmp_path_factory.mktemp("pose") / "figure.html"
-    write_page(session.scene, path, motion=with_parts(session, own_motion(session)))
+    write_page(session.scene, path, motion=posable(session, own_motion(session)))
     return session, path
 
 

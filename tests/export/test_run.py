@@ -148,7 +148,7 @@ def test_the_graph_of_an_edit_is_written_with_a_mask_and_its_gaussians_are_refus
     export(*how, "--format", "graph")
     assert "24 control points at 120 instants" in capsys.readouterr().out
     assert app.cli([str(argument) for argument in how]) == 2
-    assert "write a film, ply-sequence, 4dgs, tracks or graph" in capsys.readouterr().err
+    assert "write a film, html, ply-sequence, 4dgs, tracks or graph" in capsys.readouterr().err
 
 
 def test_the_cameras_of_the_data_set_are_not_written_over(run, tmp_path, capsys):

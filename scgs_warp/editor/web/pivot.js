@@ -15,9 +15,9 @@ class Pivot {
   put(event) {
     const { tools } = this, { player } = tools, point = tools.surface(event);
     if (!point) return;
-    const node = tools.nearest(point), row = 28 * node, table = player.shown;
-    const away = [0, 1, 2].map((r) => point[r] - table[row + 4 * r + 3]);
-    const local = [0, 1, 2].map((c) => away.reduce((sum, value, r) => sum + table[row + 4 * r + c] * value, 0));
+    const node = tools.nearest(point), map = nodeMap(player.model.facts, player.shown, node);
+    const away = [0, 1, 2].map((r) => point[r] - map[4 * r + 3]);
+    const local = [0, 1, 2].map((c) => away.reduce((sum, value, r) => sum + map[4 * r + c] * value, 0));
     this.moved = { of: this.turned, node, local };
     player.stale = true;
   }
@@ -26,8 +26,7 @@ class Pivot {
   place() {
     const { moved, tools } = this, table = tools.player.shown;
     if (!moved || !table || moved.of !== this.turned) return null;
-    const row = 28 * moved.node;
-    return [0, 1, 2].map((r) => dot(table.subarray(row + 4 * r, row + 4 * r + 3), moved.local) + table[row + 4 * r + 3]);
+    return mapped(nodeMap(tools.player.model.facts, table, moved.node), moved.local);
   }
 
   reset() {

@@ -45,17 +45,18 @@ class StudioPlayer extends Player {
 
   // Keep where the control points are, and light up what the pointer is on.
   observe(table) {
-    const { nodes, trajectories } = this.model, { rest } = trajectories;
-    this.places ??= new Float64Array(3 * nodes);
+    const { nodes, facts } = this.model, width = nodeWidth(facts);
     this.shown = table.slice();
+    this.places = this.placesIn(table, this.places);
+    for (let m = 0; m < nodes; m++) table[width * m + 19] = this.tools?.lights(m) ? 1 : 0;
+  }
+
+  // Where a table of poses has the control points, the units of the page.
+  placesIn(table, places = new Float64Array(3 * this.model.nodes)) {
+    const { nodes, facts, trajectories: { rest } } = this.model;
     for (let m = 0; m < nodes; m++) {
-      const row = 28 * m;
-      for (let r = 0; r < 3; r++) {
-        const at = row + 4 * r;
-        this.places[3 * m + r] = table[at] * rest[3 * m] + table[at + 1] * rest[3 * m + 1] + table[at + 2] * rest[3 * m + 2]
-          + table[at + 3];
-      }
-      table[row + 19] = this.tools?.lights(m) ? 1 : 0;
+      places.set(mapped(nodeMap(facts, table, m), rest.subarray(3 * m, 3 * m + 3)), 3 * m);
     }
+    return places;
   }
 }

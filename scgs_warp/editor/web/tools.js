@@ -312,16 +312,8 @@ class Tools {
 
   // Control points of the scene without the edit, at the time shown.
   unedited() {
-    const { player } = this, { model } = player, table = new Float32Array(28 * model.nodes);
-    poseAt(model, sceneTime(this.state, player.at), table);
-    const places = new Float64Array(3 * model.nodes), { rest } = model.trajectories;
-    for (let m = 0; m < model.nodes; m++) {
-      for (let r = 0; r < 3; r++) {
-        const at = 28 * m + 4 * r;
-        places[3 * m + r] = dot(table.subarray(at, at + 3), rest.subarray(3 * m, 3 * m + 3)) + table[at + 3];
-      }
-    }
-    return places;
+    const { player } = this, { model } = player, table = new Float32Array(nodeWidth(model.facts) * model.nodes);
+    return player.placesIn(poseAt(model, sceneTime(this.state, player.at), table));
   }
 
   // Trained trajectories of the selection, or of some control points, from blue to red.

@@ -3,8 +3,27 @@
 const WIDTH = 2048; // of all data textures
 
 // Numbers of a control point's pose: three rows of the map x -> R (x - p) + p + t, the rotation of shapes, the change of
-// log scales or the tint, and the glow; under an edit also the rotation that shading follows, and that of colours.
-const nodeWidth = (facts) => (facts.edited ? 28 : 20);
+// log scales or the tint, and the glow; under an edit also the rotation that shading follows, and that of colours. With
+// a mask, which weakens the motion but no handle, what handles do to the moved control point comes after that: three
+// rows of a map, and its rotation.
+const layered = (facts) => facts.edited && facts.masked;
+const nodeWidth = (facts) => (layered(facts) ? 44 : facts.edited ? 28 : 20);
+
+const mapped = (map, [x, y, z]) => [0, 4, 8].map((r) => map[r] * x + map[r + 1] * y + map[r + 2] * z + map[r + 3]);
+
+// The map of control point m, rows as in a table of poses: motion, then handles.
+function nodeMap(facts, table, m) {
+  const row = nodeWidth(facts) * m, motion = table.subarray(row, row + 12);
+  if (!layered(facts)) return motion;
+  const handles = table.subarray(row + 28, row + 40), whole = new Float32Array(12);
+  for (let c = 0; c < 4; c++) {
+    const [x, y, z] = [motion[c], motion[4 + c], motion[8 + c]], w = c === 3 ? 1 : 0;
+    for (const r of [0, 4, 8]) {
+      whole[r + c] = handles[r] * x + handles[r + 1] * y + handles[r + 2] * z + handles[r + 3] * w;
+    }
+  }
+  return whole;
+}
 
 // Columns are decoded when they are asked for, and not kept: codes of all of them take more memory than the scene.
 class Columns {
@@ -111,6 +130,8 @@ function readNodes(facts, columns) {
     shape: facts.shapes ? read("shape", 4, rows) : null,
     own: facts.turned ? read("own", 4, rows) : null,
     turn: facts.turned ? read("turn", 4, rows) : null,
+    shift: facts.turned && facts.masked ? read("shift", 3, rows) : null,
+    further: facts.turned && facts.masked ? read("further", 4, rows) : null,
     extra: facts.scaled ? read("log_scale", 3, rows) : facts.tinted ? read("tint", 3, rows) : null,
   };
 }
@@ -160,7 +181,7 @@ async function readModel(raw) {
   return model;
 }
 
-const UNTURNED = [1, 0, 0, 0];
+const UNTURNED = [1, 0, 0, 0], UNMOVED = [0, 0, 0];
 
 // Control points at a time in [0, 1], nodeWidth(facts) numbers each.
 function poseAt(model, time, table) {
@@ -178,7 +199,7 @@ function poseAt(model, time, table) {
     const norm = Math.hypot(...quat);
     for (let a = 0; a < 4; a++) quat[a] /= norm;
   };
-  const shift = [0, 0, 0], extra = [0, 0, 0];
+  const shift = [0, 0, 0], extra = [0, 0, 0], beyond = [0, 0, 0];
   for (let m = 0; m < nodes; m++) {
     const row = width * m, rest = trajectories.rest.subarray(3 * m, 3 * m + 3);
     unit(trajectories.rotation, m);
@@ -193,6 +214,14 @@ function poseAt(model, time, table) {
     table.set(quat, row + 20);
     if (trajectories.turn) unit(trajectories.turn, m);
     table.set(trajectories.turn ? quat : UNTURNED, row + 24);
+    if (!layered(facts)) continue;
+    if (trajectories.further) {
+      unit(trajectories.further, m);
+      blend(trajectories.shift, 3, m, beyond);
+    }
+    const moved = shift.map((value, a) => value + rest[a]), further = trajectories.further ? quat : UNTURNED;
+    setMap(table, row + 28, further, moved, trajectories.further ? beyond : UNMOVED);
+    table.set(further, row + 40);
   }
   return table;
 }

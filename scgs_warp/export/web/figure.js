@@ -63,14 +63,9 @@ class Figure {
 
   // Where the motion has the control points, from the table of poses before the figure is posed.
   observe(table) {
-    const { rest } = this.model.trajectories, width = nodeWidth(this.model.facts);
+    const { facts, trajectories: { rest } } = this.model;
     for (let m = 0; m < this.count; m++) {
-      for (let r = 0; r < 3; r++) {
-        const at = width * m + 4 * r;
-        let sum = table[at + 3];
-        for (let c = 0; c < 3; c++) sum += table[at + c] * rest[3 * m + c];
-        this.now[3 * m + r] = sum;
-      }
+      this.now.set(mapped(nodeMap(facts, table, m), rest.subarray(3 * m, 3 * m + 3)), 3 * m);
     }
     this.frames = this.parts.map((part, row) => this.jointFrame(part, row));
   }
@@ -196,9 +191,12 @@ class Figure {
   }
 
   write(table) {
-    const { rest } = this.model.trajectories, width = nodeWidth(this.model.facts), { points, turns } = this.shape;
+    const { facts, trajectories: { rest } } = this.model, { points, turns } = this.shape, width = nodeWidth(facts);
+    const handles = layered(facts);
     for (let m = 0; m < this.count; m++) {
-      const row = width * m, turn = Array.from(turns.subarray(4 * m, 4 * m + 4)), rows = rotationRows(turn), map = [];
+      const turn = Array.from(turns.subarray(4 * m, 4 * m + 4)), rows = rotationRows(turn), map = [];
+      const own = rest.subarray(3 * m, 3 * m + 3), row = width * m + (handles ? 28 : 0);
+      const from = handles ? mapped(table.subarray(width * m, width * m + 12), own) : own;
       for (let r = 0; r < 3; r++) {
         for (let c = 0; c < 3; c++) {
           let sum = 0;
@@ -210,11 +208,11 @@ class Figure {
         let offset = points[3 * m + r];
         for (let c = 0; c < 3; c++) {
           table[row + 4 * r + c] = map[3 * r + c];
-          offset -= map[3 * r + c] * rest[3 * m + c];
+          offset -= map[3 * r + c] * from[c];
         }
         table[row + 4 * r + 3] = offset;
       }
-      for (const first of [12, 24]) {
+      for (const first of handles ? [12] : [12, 24]) {
         table.set(qMultiply(turn, Array.from(table.subarray(row + first, row + first + 4))), row + first);
       }
     }

@@ -10,12 +10,15 @@ function makeSorter(model) {
   const histogram = new Uint32Array(BINS);
   const planes = new Float64Array(4 * Math.max(nodes, 1));
 
+  const layered = shares && width > 28; // data.js: the mask does not weaken handles
+  const last = layered ? 28 : 0; // the map after which depth counts
+
   // Depth is linear in the position, and so it is under every control point's own map.
   function nodePlanes(row, shift, table) {
     for (let m = 0; m < nodes; m++) {
       for (let c = 0; c < 4; c++) {
         let sum = c === 3 ? shift : 0;
-        for (let r = 0; r < 3; r++) sum += row[r] * table[width * m + 4 * r + c];
+        for (let r = 0; r < 3; r++) sum += row[r] * table[width * m + last + 4 * r + c];
         planes[4 * m + c] = sum;
       }
     }
@@ -38,9 +41,9 @@ function makeSorter(model) {
     into[6] = 2 * (x * z - w * y), into[7] = 2 * (y * z + w * x), into[8] = 1 - 2 * (x * x + y * y);
   }
 
-  // What a corrective adds to the depth: as corrective() in splat.frag.glsl.
+  // What a corrective adds to the position along an axis: as corrective() in splat.frag.glsl.
   const turn = new Float64Array(9), carried = new Float64Array(9);
-  function correctiveDepth(i, row, table) {
+  function correctiveAlong(i, row, table) {
     rotationOf(i, 12, table, carried);
     if (width > 20) rotationOf(i, 20, table, turn);
     else turn.set(carried);
@@ -52,6 +55,21 @@ function makeSorter(model) {
       depth += shift * (row[0] * carried[a] + row[1] * carried[3 + a] + row[2] * carried[6 + a]);
     }
     return 0.1 * depth;
+  }
+
+  // Where the motion takes a Gaussian by its share, before handles do.
+  const AXES = [[1, 0, 0], [0, 1, 0], [0, 0, 1]], moved = [0, 0, 0];
+  function place(i, x, y, z, table) {
+    for (let r = 0; r < 3; r++) {
+      moved[r] = correctives ? correctiveAlong(i, AXES[r], table) : 0;
+      for (let k = stride * i; k < stride * (i + 1); k++) {
+        const at = width * indices[k] + 4 * r;
+        moved[r] += weights[k] * (table[at] * x + table[at + 1] * y + table[at + 2] * z + table[at + 3]);
+      }
+      const rest = means[4 * i + r];
+      moved[r] = rest + shares[i] * (moved[r] - rest);
+    }
+    return moved;
   }
 
   function pass(from, to, amount, bits) {
@@ -72,8 +90,8 @@ function makeSorter(model) {
     nodePlanes(row, shift, table);
     let amount = 0, least = Infinity, most = -Infinity;
     for (let i = 0; i < count; i++) {
-      const x = means[4 * i], y = means[4 * i + 1], z = means[4 * i + 2];
-      let depth = 0;
+      let x = means[4 * i], y = means[4 * i + 1], z = means[4 * i + 2], depth = 0;
+      if (layered) [x, y, z] = place(i, x, y, z, table);
       if (nodes === 0 || shares) depth = row[0] * x + row[1] * y + row[2] * z + shift;
       if (nodes > 0) {
         let moved = 0;
@@ -81,8 +99,8 @@ function makeSorter(model) {
           const m = 4 * indices[k];
           moved += weights[k] * (planes[m] * x + planes[m + 1] * y + planes[m + 2] * z + planes[m + 3]);
         }
-        if (correctives) moved += correctiveDepth(i, row, table);
-        depth = shares ? depth + shares[i] * (moved - depth) : moved;
+        if (correctives && !layered) moved += correctiveAlong(i, row, table);
+        depth = shares && !layered ? depth + shares[i] * (moved - depth) : moved;
       }
       depth = Math.fround(depth); // as it is stored: the farthest must not lie beyond `most`
       if (!(depth >= 0.01)) continue;

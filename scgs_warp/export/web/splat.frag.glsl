@@ -10,7 +10,8 @@ uniform vec3 u_sh_low[15], u_sh_step[15];
 uniform usampler2D u_indices;   // BLOCKS a Gaussian
 uniform sampler2D u_weights;    // BLOCKS a Gaussian
 // NODE_TEXELS a control point: affine map by rows, rotation of shapes, change of log scales or tint with the glow; with
-// EDITED also the rotation that shading and correctives follow, and the one that turns colours
+// EDITED also the rotation that shading and correctives follow, and the one that turns colours; with EDITED and MASKED
+// then what handles do: affine map by rows, rotation
 uniform sampler2D u_nodes;
 uniform int u_count;
 uniform vec3 u_view[3];         // rows of the rotation, world to camera
@@ -64,6 +65,32 @@ vec4 towards(vec4 a, vec4 b) {
   return dot(a, b) < 0.0 ? -a : a;
 }
 
+#if defined(EDITED) && defined(MASKED)
+// Move a Gaussian with its control points from the motion on, whatever its share of that.
+void handle(int i, inout Pose pose) {
+  vec3 moved = vec3(0.0);
+  vec4 blend = vec4(0.0), first = vec4(0.0), homogeneous = vec4(pose.mean, 1.0);
+  for (int block = 0; block < BLOCKS; block++) {
+    uvec4 indices = texelFetch(u_indices, at(BLOCKS * i + block), 0);
+    vec4 weights = texelFetch(u_weights, at(BLOCKS * i + block), 0);
+    for (int k = 0; k < 4; k++) {
+      int m = NODE_TEXELS * int(indices[k]) + 7;
+      moved += weights[k] * vec3(
+        dot(texelFetch(u_nodes, at(m), 0), homogeneous),
+        dot(texelFetch(u_nodes, at(m + 1), 0), homogeneous),
+        dot(texelFetch(u_nodes, at(m + 2), 0), homogeneous));
+      vec4 rotation = texelFetch(u_nodes, at(m + 3), 0);
+      if (block == 0 && k == 0) first = rotation;
+      blend += weights[k] * towards(rotation, first);
+    }
+  }
+  blend = normalize(blend);
+  pose.mean = moved;
+  pose.quat = multiply(blend, pose.quat);
+  pose.turn = multiply(blend, pose.turn);
+}
+#endif
+
 void follow(int i, inout Pose pose, float share) {
 #if NODES > 0
   vec3 moved = vec3(0.0);
@@ -108,6 +135,10 @@ void follow(int i, inout Pose pose, float share) {
   quat = normalize(rest + share * (towards(quat, rest) - rest));
   other = normalize(rest + share * (towards(other, rest) - rest));
   extra.xyz *= share;
+#ifdef EDITED
+  vec4 whole = vec4(1.0, 0.0, 0.0, 0.0);
+  pose.turn = normalize(whole + share * (towards(pose.turn, whole) - whole));
+#endif
 #endif
   pose.mean = moved;
   pose.quat = quat;
@@ -117,6 +148,9 @@ void follow(int i, inout Pose pose, float share) {
   pose.tint = extra.xyz;
 #else
   pose.scale += extra.xyz;
+#endif
+#if defined(EDITED) && defined(MASKED)
+  handle(i, pose);
 #endif
 #endif
 }
