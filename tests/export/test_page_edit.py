@@ -57,6 +57,9 @@ def test_frames_of_an_edit_are_those_of_the_session(browser, options, tmp_path):
         assert psnr(visit.render(camera, at / 2.0, background), ours) > 45, at
         plain = session.scene.render(camera, session.scene_time(at), background).rgb.clamp(0, 1).numpy()
         assert at == 0.0 or psnr(plain, ours) < 35, "the edit shows"
+    visit.page.keyboard.press("h")
+    assert visit.page.get_by_text("follows the film's camera").is_visible(), "the help names the key"
+    visit.page.keyboard.press("Escape")
     visit.ask("player.seek(0.65)")
     visit.ask("player.frame()")
     seen = visit.ask("player.orbit.camera(512, 512).viewmat")

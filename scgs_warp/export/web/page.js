@@ -22,7 +22,7 @@ function requireBrowser() {
 function showModel(player) {
   const { model } = player;
   for (const part of document.querySelectorAll(".moving")) part.hidden = !model.nodes;
-  element("film").hidden = !model.facts.path;
+  for (const part of document.querySelectorAll(".filmed")) part.hidden = !model.facts.path;
   followFilm(player, player.follows);
   showTime(player);
 }
