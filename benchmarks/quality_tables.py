@@ -143,7 +143,7 @@ def beside(columns: tuple[Column, ...], rows: tuple[tuple[str, str], ...]) -> Ca
 
 
 OWN_ROWS = (
-    ("cpu", "**`cpu`** (24,000 steps, one CPU core)"),
+    ("cpu", "**`cpu`** (24,000 steps, two CPU cores)"),
     ("hexplane", "`hexplane` (4D-GS's model, `cpu` with 12,000 steps, one CPU core)"),
     ("best-spared", "**`best`** (40,000 steps, one CPU core)"),
     ("best-40000", "`best` before rigidity spared edges (two CPU cores)"),
