@@ -283,7 +283,7 @@ def test_frames_of_other_containers_have_their_moments(tmp_path, kind):
     files[0].parent.mkdir()
     for file in files:
         encoded(file, 40)
-    rig = pipeline._Rig(RigRequest(files[0].parent), tmp_path / "out", files, "x", "cpu", silent)
+    rig = pipeline._Rig(RigRequest(files[0].parent), tmp_path / "out", {f.stem: f for f in files}, "x", "cpu", silent)
     with rig.journal.started():
         line = rig.frames([0.0, 0.08], known=False)
     np.testing.assert_allclose(line.moments, np.tile(np.arange(38) / 25, (2, 1)), atol=1e-9)
@@ -299,7 +299,8 @@ def test_films_that_are_cut_off_or_damaged(tmp_path):
         encoded(source / f"{name}.mp4", 100, {"movflags": "faststart"})
     content = (source / "a.mp4").read_bytes()
     (source / "a.mp4").write_bytes(content[: 6 * len(content) // 10])
-    rig = pipeline._Rig(RigRequest(source), tmp_path / "out", [source / "a.mp4", source / "b.mp4"], "x", "cpu", silent)
+    videos = {"a": source / "a.mp4", "b": source / "b.mp4"}
+    rig = pipeline._Rig(RigRequest(source), tmp_path / "out", videos, "x", "cpu", silent)
     with rig.journal.started():
         line = rig.frames([0.0, 0.0], known=False)
     assert 1.0 < line.seconds[-1] < 3.5 and len(rig.cut_off()) == 1
